@@ -52,6 +52,8 @@ LEAST_AHEAD = 0.1
 CONTRACTED_SIDE = 4.0
 """Of the cube that holds contracted space."""
 COARSEST_LEVEL, FINEST_LEVEL = 9, 12
+LEAST_DISTANCE = 0.1
+"""Of a camera from what it shows, in units of the farthest camera's."""
 TABLE_SIZES = {512: 18, 1024: 19, 2048: 19, 4096: 20}
 """log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
 IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
@@ -288,18 +290,20 @@ def model_for(scene: Scene) -> tuple[str, str]:
     return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
 
 
-def grid_for(scene: Scene) -> tuple[int, int]:
-    """Return the finest resolution of a hash grid whose cells are as small as the pixels, and log2 of its table's size.
+def grid_for(scene: Scene) -> int:
+    """Return the finest resolution of a hash grid whose cells are as small as the pixels.
 
-    Half of the pixels of known distance are at least as wide, where they see the scene, as a cell: of the cube from
-    -2 to 2 that all of space is contracted to, or of normalised device coordinates, in which a picture has width 2.
+    Half of the pixels are at least as wide, where they see the scene, as a cell: of the cube from -2 to 2 that all of
+    space is contracted to, or of normalised device coordinates, in which a picture has width 2. They see it where
+    sparse points or depths say; where there are none, as far away as the middle of the scene.
     """
-    assert scene.depths is not None
-    view = scene.depths.pixels.view
+    cameras, train = scene.cameras, torch.tensor(scene.splits["train"])
     if scene.space == "ndc":
-        cells = torch.maximum(scene.cameras.width, scene.cameras.height)[view].double()
+        cells = torch.maximum(cameras.width, cameras.height)[train].double()
+    elif scene.depths is not None:
+        cells = CONTRACTED_SIDE * cameras.focal.mean(dim=-1)[scene.depths.pixels.view] / scene.depths.distance
     else:
-        cells = CONTRACTED_SIDE * scene.cameras.focal.mean(dim=-1)[view].double() / scene.depths.distance
+        distance = cameras.c2w[train, :, 3].norm(dim=-1).clamp(min=LEAST_DISTANCE)
+        cells = CONTRACTED_SIDE * cameras.focal.mean(dim=-1)[train] / distance
     levels = math.ceil(math.log2(float(cells.median())))
-    resolution = 1 << min(max(levels, COARSEST_LEVEL), FINEST_LEVEL)
-    return resolution, TABLE_SIZES[resolution]
+    return 1 << min(max(levels, COARSEST_LEVEL), FINEST_LEVEL)

@@ -89,11 +89,11 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     2 sum_i w_i (m_i sum_{j<i} w_j - sum_{j<i} w_j m_j).
     """
     edges, w = rendering.samples.edges, rendering.weights
-    if rendering.samples.contracted_spacing:
-        edges = normalized_distance(edges)
     kernels = _kernels_for(w)
     if kernels is not None and not edges.requires_grad:
-        return kernels.distortion(edges, w)
+        return kernels.distortion(edges, w, rendering.samples.contracted_spacing)
+    if rendering.samples.contracted_spacing:
+        edges = normalized_distance(edges)
     span = (edges[..., -1:] - edges[..., :1]).clamp(min=1e-6)
     m = (0.5 * (edges[..., :-1] + edges[..., 1:]) - edges[..., :1]) / span
     before, moment = w.cumsum(dim=-1) - w, (w * m).cumsum(dim=-1) - w * m

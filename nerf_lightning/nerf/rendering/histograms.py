@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
 from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.kernels.search import search
 
@@ -16,6 +17,7 @@ def sample_histogram(
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
     floor: float = 1e-5,
+    contracted: bool = False,
 ) -> Float[Tensor, "*rays count"]:
     """Return where the cumulative distribution of a histogram reaches `u` (Sec. 5.2, arXiv 2003.08934).
 
@@ -25,6 +27,7 @@ def sample_histogram(
         u: numbers in [0, 1), in order.
         floor: mass added to each bin, so that an empty ray is sampled evenly and no bin has zero width in the
             distribution.
+        contracted: whether the mass of a bin is spread evenly over `normalized_distance`, and not over the distance.
 
     >>> sample_histogram(torch.tensor([0.0, 1, 2]), torch.tensor([0.0, 1]), torch.tensor([0.5]), floor=0.0)
     tensor([1.5000])
@@ -33,7 +36,9 @@ def sample_histogram(
         raise ValueError(f"{weights.shape[-1]} weights need {weights.shape[-1] + 1} edges, not {edges.shape[-1]}")
     kernels = cpu_backend("histograms.cpu", u.device) if u.dim() == 2 and edges.dtype == torch.float32 else None
     if kernels is not None and not (edges.requires_grad or weights.requires_grad):
-        return kernels.sample(edges, weights, u, floor)
+        return kernels.sample(edges, weights, u, floor, contracted)
+    if contracted:
+        return from_normalized_distance(sample_histogram(normalized_distance(edges), weights, u, floor))
     mass = weights + floor
     cdf = torch.cumsum(mass / mass.sum(dim=-1, keepdim=True), dim=-1)
     cdf = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1)

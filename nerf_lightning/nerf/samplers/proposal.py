@@ -2,7 +2,6 @@
 
 import torch
 
-from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
 from nerf_lightning.nerf.samplers.base import DenseSampler
@@ -33,10 +32,9 @@ class ProposalSampler(DenseSampler):
         strata = torch.arange(count, device=edges.device, dtype=edges.dtype)
         within = 0.5 if random is None else random.uniform("proposal", count)
         u = ((strata + within) / count).expand(*edges.shape[:-1], -1)
-        if not history[-1].samples.contracted_spacing:
-            return RaySamples(edges=sample_histogram(edges, weights, u, floor=self.padding))
-        shares = sample_histogram(normalized_distance(edges), weights, u, floor=self.padding)
-        return RaySamples(edges=from_normalized_distance(shares), contracted_spacing=True)
+        contracted = history[-1].samples.contracted_spacing
+        found = sample_histogram(edges, weights, u, self.padding, contracted)
+        return RaySamples(edges=found, contracted_spacing=contracted)
 
     def num_samples_after(self, before: int) -> int:
         """Always `num_samples`.

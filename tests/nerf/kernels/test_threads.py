@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerf_lightning.nerf.kernels.search import search, search_by_comparison
-from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
+from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, over_rows, torch_on_one_thread
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +43,27 @@ def test_results_come_in_order_parts_within_parts_wait_for_nobody_and_what_fails
     assert in_parallel(slow_first, range(4)) == [[part, 0, 1, 2] for part in range(4)]
     with pytest.raises(ZeroDivisionError):
         in_parallel(lambda part: 1 // part, range(3))
+
+
+def test_torch_may_have_one_thread_while_work_is_shared_out():
+    with torch_on_one_thread():
+        assert (torch.get_num_threads(), num_threads()) == (1, 2)
+        seen = in_parallel(lambda part: (torch.get_num_threads(), num_threads(), threading.get_ident()), range(64))
+        assert {each[:2] for each in seen} == {(1, 1)}
+        with torch_on_one_thread():
+            assert num_threads() == 2
+        assert (torch.get_num_threads(), num_threads()) == (1, 2)
+    assert (torch.get_num_threads(), num_threads()) == (2, 2)
+
+
+def test_the_calling_thread_takes_parts_as_well():
+    both = threading.Barrier(2, timeout=10)  # each of two parts waits for the other
+
+    def meet(part):
+        both.wait()
+        return threading.get_ident()
+
+    assert threading.get_ident() in in_parallel(meet, range(2))
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])

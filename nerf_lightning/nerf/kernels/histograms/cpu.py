@@ -11,9 +11,11 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
+from nerf_lightning.nerf.geometry.contraction import TINY
 from nerf_lightning.nerf.kernels.threads import over_rows
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+LEAST_LEFT = np.float32(TINY)
 
 
 def sample(
@@ -21,11 +23,12 @@ def sample(
     weights: Float[Tensor, "rays bins"],
     u: Float[Tensor, "rays count"],
     floor: float,
+    contracted: bool,
 ) -> Float[Tensor, "rays count"]:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
     out = torch.empty(u.shape)
     arrays = (each.detach().contiguous().numpy() for each in (edges, weights, u))
-    over_rows(_sample, len(u), *arrays, np.float32(floor), out.numpy())
+    over_rows(_sample, len(u), *arrays, np.float32(floor), contracted, out.numpy())
     return out
 
 
@@ -36,31 +39,33 @@ def interlevel(
     v: Float[Tensor, "rays bins"],
 ) -> Float[Tensor, "rays"]:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
-    return _Loss.apply(_interlevel, v, *(each.detach().contiguous() for each in (t, w, u)))
+    return _Loss.apply(_interlevel, (), v, *(each.detach().contiguous() for each in (t, w, u)))
 
 
-def distortion(edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays"]:
+def distortion(
+    edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"], contracted: bool
+) -> Float[Tensor, "rays"]:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
-    return _Loss.apply(_distortion, w, edges.detach().contiguous())
+    return _Loss.apply(_distortion, (contracted,), w, edges.detach().contiguous())
 
 
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]]), torch.ones(1, 2)
-    sample(edges, weights, torch.tensor([[0.5]]), 0.01)
+    sample(edges, weights, torch.tensor([[0.5]]), 0.01, True)
     interlevel(edges, weights, edges, weights)
-    distortion(edges, weights)
+    distortion(edges, weights, True)
 
 
 class _Loss(torch.autograd.Function):
     """A number per ray whose gradient for some weights is found with it."""
 
     @staticmethod
-    def forward(ctx: Any, kernel: Any, weights: Tensor, *given: Tensor) -> Tensor:
+    def forward(ctx: Any, kernel: Any, flags: tuple[bool, ...], weights: Tensor, *given: Tensor) -> Tensor:
         weights = weights.contiguous()
         out, grad = weights.new_empty(len(weights)), torch.empty_like(weights)
         arrays = (each.numpy() for each in (weights, *given, out, grad))
-        over_rows(kernel, len(weights), *arrays)
+        over_rows(kernel, len(weights), *flags, *arrays)
         ctx.save_for_backward(grad)
         return out
 
@@ -68,12 +73,21 @@ class _Loss(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         (own,) = ctx.saved_tensors
-        return None, own * grad[:, None], None, None, None
+        return None, None, own * grad[:, None], *[None] * (len(ctx.needs_input_grad) - 3)
+
+
+@njit
+@no_type_check
+def _spaced(distance, contracted):
+    # In which even steps are even: `geometry.contraction.normalized_distance`.
+    if not contracted:
+        return distance
+    return HALF * distance if distance < ONE else ONE - HALF / distance
 
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _sample(first, last, edges, weights, u, floor, out):
+def _sample(first, last, edges, weights, u, floor, contracted, out):
     bins = weights.shape[1]
     for r in range(first, last):
         total = ZERO
@@ -86,7 +100,11 @@ def _sample(first, last, edges, weights, u, floor, out):
                 below, above = above, above + (weights[r, i] + floor) / total
             span = above - below
             part = min(max((u[r, k] - below) / span, ZERO), ONE) if span > ZERO else HALF
-            out[r, k] = edges[r, i] + part * (edges[r, i + 1] - edges[r, i])
+            left, right = _spaced(edges[r, i], contracted), _spaced(edges[r, i + 1], contracted)
+            at = left + part * (right - left)
+            if contracted:  # back again: `from_normalized_distance`
+                at = TWO * at if at < HALF else HALF / max(ONE - at, LEAST_LEFT)
+            out[r, k] = at
 
 
 @njit(nogil=True, cache=True)
@@ -116,15 +134,15 @@ def _interlevel(first, last, v, t, w, u, out, grad):
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _distortion(first, last, w, edges, out, grad):
-    samples = w.shape[1]
+def _distortion(first, last, contracted, w, edges, out, grad):
+    samples, at = w.shape[1], np.empty(w.shape[1] + 1, np.float32)
     for r in range(first, last):
-        start = edges[r, 0]
-        span = max(edges[r, samples] - start, np.float32(1e-6))
+        for i in range(samples + 1):
+            at[i] = _spaced(edges[r, i], contracted)
+        start, span = at[0], max(at[samples] - at[0], np.float32(1e-6))
         before = moment = pairs = own = ZERO
         for i in range(samples):
-            m = (HALF * (edges[r, i] + edges[r, i + 1]) - start) / span
-            length = (edges[r, i + 1] - edges[r, i]) / span
+            m, length = (HALF * (at[i] + at[i + 1]) - start) / span, (at[i + 1] - at[i]) / span
             nearer = m * before - moment
             pairs += w[r, i] * nearer
             own += w[r, i] * w[r, i] * length
@@ -133,7 +151,7 @@ def _distortion(first, last, w, edges, out, grad):
             moment += w[r, i] * m
         behind = later = ZERO
         for i in range(samples - 1, -1, -1):
-            m = (HALF * (edges[r, i] + edges[r, i + 1]) - start) / span
+            m = (HALF * (at[i] + at[i + 1]) - start) / span
             grad[r, i] += TWO * (later - m * behind)
             behind += w[r, i]
             later += w[r, i] * m
