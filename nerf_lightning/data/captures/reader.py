@@ -21,7 +21,7 @@ from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
-from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, image_size, orientation_of
+from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
@@ -241,7 +241,7 @@ class CaptureReader(Reader):
         """Return by what the photographs shrink."""
         if self.downscale != "auto":
             return self.downscale
-        longest = max(max(image_size(view.photograph.path)) for view in capture.views)
+        longest = max(max(upright_size(view.photograph)) for view in capture.views)
         factor = -(-longest // (MOST_AROUND if capture.lens_model == "equirectangular" else MOST_PIXELS))
         log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
         return factor
@@ -353,9 +353,10 @@ def as_calibrated(capture: Capture) -> Capture:
     views, kept, turned = list(capture.views), [], []
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
-            orientation, (width, height) = orientation_of(view.photograph.path), image_size(view.photograph.path)
+            header = view.photograph.header or read_header(view.photograph.path)
+            orientation, (width, height) = header.orientation, header.size
             upright = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
-            views[number] = replace(view, photograph=replace(view.photograph, upright=upright))
+            views[number] = replace(view, photograph=replace(view.photograph, upright=upright, header=header))
             require_fit(view, *((height, width) if upright else (width, height)))
             kept.append(number)
             if orientation != 1:

@@ -16,7 +16,8 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import cameras_of, decoded, require_fit
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.images import ENDINGS, image_size, read_rgba
+from nerf_lightning.data.pixels.decoding import upright_size
+from nerf_lightning.data.pixels.images import ENDINGS, read_rgba
 from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import GivenFrameReader
@@ -188,7 +189,7 @@ def _is_photographed(path: Path) -> bool:
 
 def _of_one_size(capture: Capture) -> tuple[Capture, tuple[int, int]]:
     """Return the views whose images have the most frequent (width, height), and that size."""
-    sizes = [image_size(view.photograph.path) for view in capture.views]
+    sizes = [upright_size(view.photograph) for view in capture.views]
     usual = Counter(sizes).most_common(1)[0][0]
     kept = []
     for number, (view, size) in enumerate(zip(capture.views, sizes, strict=True)):
