@@ -112,10 +112,9 @@ class CaptureReader(Reader):
         with reading(self.root):
             capture = self.capture()
         capture = self._wanted(capture)
-        if capture.splits is None:  # before views are left out, so that the others keep their splits
-            train, held = (
-                every_kth(range(len(capture.views)), self.hold_every) if len(capture.views) > 1 else ((0,), ())
-            )
+        if capture.splits is None and len(capture.views) > 1:
+            # Before views are left out, so that the others keep their splits.
+            train, held = every_kth(range(len(capture.views)), self.hold_every)
             capture = replace(capture, splits={"train": train, "val": held, "test": held})
         capture = as_calibrated(usable(capture))
         capture = self._with_masks(capture)
@@ -177,9 +176,7 @@ class CaptureReader(Reader):
     def _located_folder(self) -> Path:
         folder = self.named_folder()
         found = located(folder, lambda path: path if self.found_in(path) else None)
-        if len(found) > 1:
-            choice = listed((f"scene.root={path}" for path in found), 4)
-            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
+        require_one(found, self.root)
         if found and found[0] != folder:
             log.info("%s holds no capture of scene=%s; %s, which does, is read", self.root, self.name, found[0])
         return found[0] if found else folder
@@ -277,8 +274,8 @@ class CaptureReader(Reader):
         return capture.some(kept)
 
     def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
-        assert capture.splits is not None
-        splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
+        given = capture.splits or {"train": tuple(range(len(capture.views)))}
+        splits = {split: given.get(split, ()) for split in ("train", "val", "test")}
         names = [view.name for view in capture.views]
         splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
         if splits["train"] and not (splits["val"] or splits["test"]):
@@ -322,6 +319,13 @@ def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Fo
         below = [path for each in below for path in _folders_in(each)][:MOST_FOLDERS]
         found = found or [known for path in below if (known := near(path))]
     return found
+
+
+def require_one(folders: Sequence[Path], root: str) -> None:
+    """Refuse a folder `root` that holds several captures."""
+    if len(folders) > 1:
+        choice = listed((f"scene.root={path}" for path in folders), 4)
+        raise InputError(f"{root} holds {len(folders)} captures. Choose one of them: {choice}.")
 
 
 def _folders_in(folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.checks import check_step, contents, usable
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -147,9 +147,7 @@ class BlenderReader(GivenFrameReader):
                 views[split].append(replace(found.view, name=name))
                 lenses.add(found.lens_model)
         left_out.require_enough(sum(map(len, views.values())))
-        lens_model = common_lens_model(lenses or {"pinhole"})
-        if lens_model is None:
-            raise InputError(f"{root} mixes lenses of several kinds ({listed(sorted(lenses))}). Split the capture.")
+        lens_model = one_lens_model(lenses, root)
         train, val, test = ([view.photograph.path for view in views[split]] for split in SPLITS)
         kept = set(apart(train, val, test, lambda image: image.name, self.root))
         views["train"] = [view for view in views["train"] if view.photograph.path in kept]

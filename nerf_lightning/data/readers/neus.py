@@ -23,7 +23,7 @@ from nerf_lightning.files.numpy_files import archive_headers, read_member
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+from nerf_lightning.nerf.geometry.poses import flip_yz
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 MOST_BYTES = 1 << 28
@@ -105,7 +105,7 @@ def _view(picture: Path, name: str, projection: Float[ndarray, "3 4"], where: st
     return View(
         name=name,
         photograph=Photograph(picture, header=header),
-        c2w=from_opencv_axes(c2w),
+        c2w=flip_yz(c2w),
         focal=(float(intrinsics[0, 0]), float(intrinsics[1, 1])),
         center=(float(intrinsics[0, 2]), float(intrinsics[1, 2])),
         size=(float(width), float(height)),

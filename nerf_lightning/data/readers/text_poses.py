@@ -21,7 +21,7 @@ from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+from nerf_lightning.nerf.geometry.poses import flip_yz
 
 MOST_BYTES = 1 << 16
 CURE = "Copy it again."
@@ -102,7 +102,7 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
             yield View(
                 name=prefix + name,
                 photograph=Photograph(picture, header=header),
-                c2w=from_opencv_axes(pose_from_matrix(_numbers(pose)[:16], str(pose))),
+                c2w=flip_yz(pose_from_matrix(_numbers(pose)[:16], str(pose))),
                 focal=(fx, fy),
                 center=(cx, cy),
                 size=size,
