@@ -49,7 +49,7 @@ TRAINING: dict[str, Any] = {
     "optimizer_states": list[dict[str, object]],
     "lr_schedulers": list[object],
 }
-"""What training goes on from, beside the record; the run that does holds it against its own (`resume_checks`)."""
+"""What training goes on from, beside the record; the run that does holds it against its own (`training/resume.py`)."""
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
 SIDES: dict[str, tuple[int, ...]] = {"c2w": (3, 4), "focal": (2,), "center": (2,), "lens": (6,), "ndc": (2,)}

@@ -3,8 +3,8 @@
 A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
 Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
 config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learnt, where they were),
-packed (weights in fewer bytes, where it was made smaller), pixels (a hash of each photograph), and the run's state that
-the system adds.
+quantized (weights in fewer bytes, where it was made smaller), pixels (a hash of each photograph), and the run's state
+(`training/resume.py`).
 """
 
 import contextlib
@@ -15,20 +15,24 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, scene_of
 from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.files.trust import Mismatch, reading, shown
+from nerf_lightning.files.trust import Mismatch, reading, require_like, shown
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
+OTHER_MODEL = (
+    "Use another one, or give the model, field and encoder settings that it was trained with (.hydra/overrides.yaml of "
+    "that run)."
+)
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +59,16 @@ class Checkpoint:
     """Saved while all was finite, and no step was being left out."""
     record: dict[str, Any]
     """What a checkpoint of this one would keep, beside weights."""
+
+    def load_weights(self, model: nn.Module) -> None:
+        """Put the weights into a model.
+
+        Raises:
+            InputError: with the first tensor that is missing, unknown, of another shape or dtype, or not finite.
+        """
+        with reading(self.path, OTHER_MODEL):
+            model.load_state_dict(self.weights)  # keys and shapes, which some parts take from the file
+            require_like(self.weights, model.state_dict(), "weights")
 
 
 def scene_record(scene: Scene) -> SceneRecord:

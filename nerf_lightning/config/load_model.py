@@ -1,4 +1,4 @@
-"""Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
+"""A checkpoint's config to its model, built only from our own classes and those that a person trusts."""
 
 import math
 from collections.abc import Sequence
@@ -12,17 +12,12 @@ from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.trust import reading, require_like
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.samplers.base import Sampler
 
-CURE = (
-    "Use another one, or give the model, field and encoder settings that it was trained with (.hydra/overrides.yaml of "
-    "that run)."
-)
 SPARE_NUMBERS = 1 << 24  # What a model may hold beside its weights
 
 
@@ -52,7 +47,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
             f"{held:,}. Use another checkpoint."
         )
     model = build_model(config, checkpoint)
-    load_weights(model, checkpoint)
+    checkpoint.load_weights(model)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
     # Of a point, in any layer or at the end of any encoder.
     sides = [max(matrix.shape) for matrix in matrices_of(model)]
@@ -86,10 +81,3 @@ def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
     if not isinstance(model, Model):
         raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
     return model
-
-
-def load_weights(model: Model, checkpoint: Checkpoint) -> None:
-    """Put a checkpoint's weights into a model."""
-    with reading(checkpoint.path, CURE):
-        model.load_state_dict(checkpoint.weights)  # keys and shapes, which some parts take from the file
-        require_like(checkpoint.weights, model.state_dict(), "weights")

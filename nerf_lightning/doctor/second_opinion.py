@@ -15,6 +15,7 @@ from nerf_lightning.doctor.check import Evidence
 from nerf_lightning.doctor.epipolar import agreeing, parallax, rays_of
 from nerf_lightning.doctor.features import shrunk_cameras
 from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs, nearest_views
+from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.types.scene import Cameras
 
 # The other pose must explain so many details that the given one does not, of so many from each of two other views.
@@ -160,7 +161,7 @@ def refitted(
     unit = float((center - eyes.mean(dim=0)).norm(dim=-1).mean().clamp(min=1e-9))
 
     def off(step: Float[Tensor, "*tried starts 6"]) -> Float[Tensor, "*tried starts matches"]:
-        turned = (torch.eye(3) + _cross(step[..., :3])) @ rotation
+        turned = rotation_from_vector(step[..., :3]) @ rotation
         between = eyes - (center + unit * step[..., 3:])[..., None, :]
         normal = functional.normalize(torch.linalg.cross(between, there.expand_as(between)), dim=-1)
         return focal * (normal * (local @ turned.mT)).sum(dim=-1)
@@ -176,15 +177,9 @@ def refitted(
         system = system + (1e-3 * system.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-9)[:, None, None] * torch.eye(6)
         step = -torch.linalg.solve(system, (weighted.mT @ here[..., None])[..., 0])
         step = step * (0.3 / step.norm(dim=1, keepdim=True).clamp(min=0.3))
-        rotation = torch.matrix_exp(_cross(step[:, :3])) @ rotation
+        rotation = rotation_from_vector(step[:, :3]) @ rotation
         center = center + unit * step[:, 3:]
     return torch.cat([rotation, center[:, :, None]], dim=-1).to(starts)
-
-
-def _cross(turn: Float[Tensor, "*starts 3"]) -> Float[Tensor, "*starts 3 3"]:
-    x, y, z = turn.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
 def with_pose(c2w: Float[Tensor, "views 3 4"], view: int, pose: Float[Tensor, "3 4"]) -> Float[Tensor, "views 3 4"]:

@@ -18,7 +18,7 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.escaping import for_colmap
 from nerf_lightning.nerf.geometry.frames import poses_from_user
-from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
+from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 
@@ -168,7 +168,7 @@ def _camera(cameras: Cameras, view: int) -> str:
 
 def _pose(cameras: Cameras, view: int) -> str:
     """Return world-to-camera with axes right, down, forward: a quaternion and a translation."""
-    c2w = cameras.c2w[view]
-    rotation = (c2w[:, :3] * torch.tensor([1.0, -1.0, -1.0]).to(c2w)).mT
+    c2w = flip_yz(cameras.c2w[view])
+    rotation = c2w[:, :3].mT
     translation = -rotation @ c2w[:, 3]
     return " ".join(map(repr, [*quaternion_from_rotation(rotation).tolist(), *translation.tolist()]))

@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.load_model import hold_to_budgets, load_weights
+from nerf_lightning.config.load_model import hold_to_budgets
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
@@ -65,7 +65,7 @@ def build_step(
     correction: Correction = build(config.correction)
     correction.fit_to(scene)
     if start is not None:
-        load_weights(model, start)
+        start.load_weights(model)
     return TrainStep(
         model=model,
         rays=RayGenerator.of_views(scene, model, refinement),

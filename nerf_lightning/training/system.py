@@ -1,7 +1,6 @@
 """The one LightningModule: it hands a trainer's batches to the step, and the run's state to checkpoints."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,19 @@ from torch.optim import Optimizer
 
 from nerf_lightning.checkpoints.format import KEY, LOOPS
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
-from nerf_lightning.checkpoints.resume_checks import require_resumable
 from nerf_lightning.checkpoints.same_capture import require_same_capture
-from nerf_lightning.compute import ranks
-from nerf_lightning.compute.devices import use_threads
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.rendering_step import rendering_step
+from nerf_lightning.training.resume import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 
 
@@ -161,19 +157,13 @@ class RadianceFieldSystem(LightningModule):
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
                 "Go on from it with a smaller optimizer.lr, or add gradient clipping (trainer.clip_norm=1)."
             )
-        checkpoint[KEY] = self.record | {
-            "progress": asdict(self.step.progress),
-            "bad_steps": self.step.guard.state(),
-            "tile_points": self.step.tile_points,
-            "num_threads": torch.get_num_threads(),
-            "world_size": ranks.world_size(),
-        }
+        checkpoint[KEY] = self.record | run_state(self.step)
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
         if refined is not None:
             checkpoint[KEY]["refined"] = dict(vars(refined))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place, threads, and the tile (`TrainerSettings.keep_tile`) decide a sum's last bits.
+        """Check what Lightning is about to restore, and restore the rest of the run.
 
         Raises:
             InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
@@ -194,7 +184,4 @@ class RadianceFieldSystem(LightningModule):
             loops={key: getattr(trainer, key).state_dict() for key in LOOPS},
             progress=step.progress,
         )
-        step.progress.take_up(Progress(**state["progress"]))
-        step.guard.restore(state["bad_steps"], self.device)
-        if state["world_size"] == ranks.world_size():
-            use_threads(state["num_threads"])
+        restore_run(state, step, self.device)

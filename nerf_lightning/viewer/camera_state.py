@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.near_far_of_new_views import near_and_far_from
-from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 
@@ -59,15 +59,12 @@ def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Ten
     >>> (back + 0.0).tolist()  # it looks along z
     [0.0, 0.0, -1.0]
     """
-    turned = rotation_from_quaternion(wxyz) * torch.tensor([1.0, -1.0, -1.0]).to(wxyz)
-    return torch.cat([turned, position[:, None]], dim=-1)
+    return flip_yz(torch.cat([rotation_from_quaternion(wxyz), position[:, None]], dim=-1))
 
 
 def quaternion_of(c2w: Tensor) -> np.ndarray:
     """Return the rotation of a pose as viser wants it: w, x, y, z for the axes right, down, forward."""
-    from viser.transforms import SO3
-
-    return SO3.from_matrix((c2w[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()).wxyz
+    return quaternion_from_rotation(flip_yz(c2w)[:, :3].double()).numpy()
 
 
 def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:

@@ -6,39 +6,10 @@ import sys
 
 import pytest
 from support.cold_import import cold_import
-from support.running import FAST, REPOSITORY, start
 
 from nerf_lightning.cli import prepare
 from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.config.scene_overrides import UnknownScene
-
-# Some are there in every installation, some only with extras; none has to do with a step.
-NOT_NEEDED = (
-    *("pandas", "sklearn", "skimage", "trimesh"),
-    *("pycolmap", "viser", "optuna", "sqlalchemy", "joblib", "submitit", "selenium", "IPython", "tensorflow"),
-)
-CALLBACK = """
-import sys
-from lightning.pytorch import Callback
-
-class Listed(Callback):
-    def on_train_batch_start(self, *given):
-        print("loaded:", [name for name in {names} if name in sys.modules])
-"""
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("model", [FAST, (*FAST, "data.crop_steps=0", "model=fast_small")])
-def test_nothing_that_a_step_can_do_without_is_loaded_before_it(model, tmp_path):
-    (tmp_path / "listed.py").write_text(CALLBACK.format(names=NOT_NEEDED))
-    process = start(
-        "train", *model, "trainer.max_steps=1", "trainer.tile_points=auto", "trainer.precision=32-true",
-        "final.video=false", "final.evaluate=false", "+callbacks.listed._target_=listed.Listed",
-        f"paths.output_dir={tmp_path / 'run'}", env={"PYTHONPATH": f"{tmp_path}:{REPOSITORY}"},
-    )  # fmt: skip
-    out, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, out
-    assert "loaded: []" in out.splitlines()
 
 
 def test_a_config_is_composed_without_torch():

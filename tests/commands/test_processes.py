@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST, FAST_PATH, finished, said, saved, start, start_cold
+from support.running import FAST, FAST_PATH, finished, said, saved, start, start_code, start_cold
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import processes
@@ -96,7 +96,27 @@ def is_alive(process):
     return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
 
 
-@pytest.mark.slow
+ORPHANED = """
+import os, time
+from nerf_lightning.training.launch.processes import end_with
+
+launcher, worker = os.getpid(), os.fork()
+end_with(launcher) if worker == 0 else print(worker, flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_worker_ends_with_the_process_that_has_started_it():
+    with start_code(ORPHANED) as process:
+        worker = psutil.Process(int(process.stdout.readline()))
+        process.send_signal(signal.SIGKILL)
+        deadline = time.monotonic() + 30
+        while is_alive(worker) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not is_alive(worker)
+
+
+@pytest.mark.exhaustive
 def test_workers_end_with_the_process_that_has_started_them(capture, tmp_path):
     process = start(*arguments(capture, *TWO, "trainer.max_steps=1000000", f"paths.output_dir={tmp_path}"))
     while process.poll() is None and saved(tmp_path)["global_step"] == 0:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf, open_dict
 from support.configs import composed
-from support.running import FAST, refused
+from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
@@ -185,26 +185,6 @@ def test_a_note_that_says_nothing_is_named_with_its_cure(tmp_path, content, what
     again = begin(config(tmp_path, here))
     assert again.resume_point().step == 3
     again.release()
-
-
-@pytest.mark.exhaustive
-def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "-m", "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1", "data.batch_rays=32,48",
-        "trainer.max_steps=2", "final.video=false", "evaluation.max_views=1", f"paths.root_dir={tmp_path}",
-    )  # fmt: skip
-    assert result.code == 0, result.err
-    runs = sorted((tmp_path / "sweeps").glob("*/*/metrics.json"))
-    assert len(runs) == 4
-    assert {run.parent.name for run in runs} == {
-        "0_seed=0_data.batch_rays=32", "1_seed=1_data.batch_rays=32",
-        "2_seed=0_data.batch_rays=48", "3_seed=1_data.batch_rays=48",
-    }  # fmt: skip
-    for run in runs:
-        folder = run.parent
-        assert (folder / "checkpoints/last.ckpt").is_file()
-        assert (folder / ".hydra/config.yaml").is_file()
-        assert len(EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("PSNR/test")) == 1
 
 
 def test_a_full_disk_is_said_of_the_run_where_a_logger_does_not_name_its_file(train, tmp_path, monkeypatch):

@@ -61,22 +61,3 @@ def test_damaged_parts_of_metrics_are_left_out(table, tmp_path, origin):
     assert result.code == 0, result.err
     assert "20.0" in [row["PSNR"] for row in rows]
     assert all(row["seeds"] in ("", "1") for row in ours(rows))
-
-
-def test_numbers_of_thousands_of_digits_are_no_overrides(table, tmp_path):
-    run = leave_measured_run(tmp_path / "runs" / "a")
-    (run / ".hydra").mkdir(exist_ok=True)
-    (run / ".hydra" / "overrides.yaml").write_text("- 0x" + "f" * 5000)
-    result, rows = table()
-    assert result.code == 0, result.err
-    assert len(ours(rows)) == 1
-
-
-def test_more_settings_than_a_table_shows_are_left_out(table, tmp_path):
-    for name in ("a", "b"):
-        run = leave_measured_run(tmp_path / "runs" / name)
-        (run / ".hydra").mkdir(exist_ok=True)
-        (run / ".hydra" / "overrides.yaml").write_text("".join(f"- {name}{key}=1\n" for key in range(1000)))
-    result, rows = table()
-    assert result.code == 0, result.err
-    assert len(rows[0]) < 60

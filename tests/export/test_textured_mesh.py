@@ -9,7 +9,6 @@ import torch
 import trimesh
 from PIL import Image
 from support.known_fields import ball, solid
-from support.rasterizer import in_texture
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
@@ -19,6 +18,20 @@ from nerf_lightning.messages.errors import InputError
 
 TILE, CELL = 1 << 15, 0.5
 DARK, LIGHT = (0.2, 0.3, 0.7), (0.9, 0.8, 0.3)
+
+
+def in_texture(picture, uv):
+    """Return the colours at places of a texture (v up), mixed between the four texels around each."""
+    height, width, _ = picture.shape
+    x, y = (np.nan_to_num(uv) * (1, -1) + (0, 1)).reshape(-1, 2).T * np.array([[width], [height]]) - 0.5
+    j, i = np.floor(x).astype(int), np.floor(y).astype(int)
+    u, v = (x - j)[:, None], (y - i)[:, None]
+
+    def texel(row, column):
+        return picture[row.clip(0, height - 1), column.clip(0, width - 1)].astype(float)
+
+    top, bottom = ((1 - u) * texel(row, j) + u * texel(row, j + 1) for row in (i, i + 1))
+    return ((1 - v) * top + v * bottom).reshape(*uv.shape[:-1], 3)
 
 
 def record(**changes):

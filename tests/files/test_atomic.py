@@ -1,6 +1,7 @@
 """Files that are whole or not there, and what processes that were killed leave of them."""
 
 import errno
+import sys
 
 import pytest
 from support.running import start_code
@@ -109,3 +110,16 @@ def test_whatever_befalls_a_file_is_said_of_it_and_of_no_other(tmp_path):
 def fail_in(folder, error):
     with full_disk_named(folder):
         raise error
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
+def test_no_link_is_written_through(tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "a.txt").symlink_to(tmp_path / "precious")
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("first")
+    part.symlink_to(tmp_path / "precious")
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("second")
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert (tmp_path / "a.txt").read_text() == "second"

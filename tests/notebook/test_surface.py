@@ -24,8 +24,10 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(capture, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return nl.train("scene=npz", f"scene.path={capture}", f"paths.output_dir={folder}", *SMALL)
+    folder, theirs = tmp_path_factory.mktemp("runs") / "run", HydraConfig.instance().cfg
+    trained = nl.train("scene=npz", f"scene.path={capture}", f"paths.output_dir={folder}", *SMALL)
+    assert HydraConfig.instance().cfg is theirs
+    return trained
 
 
 def test_the_types_that_are_told_are_those_of_what_is_there():
@@ -66,7 +68,6 @@ def test_a_run_leaves_folder_metrics_and_the_model_of_its_checkpoint(run):
     assert run.metrics["psnr"] == run.psnr
     assert len(run.metrics["per_image"]) == 2
     assert run.model.checkpoint.step == 4
-    assert HydraConfig.instance().cfg is None
     one, other = nl.load(run.folder, "trainer=cpu"), nl.load(run.folder / "checkpoints" / "last.ckpt", "trainer=cpu")
     assert torch.equal(one.render(0).rgb, other.render(0).rgb)
     assert not one.module.training

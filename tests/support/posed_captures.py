@@ -21,7 +21,6 @@ from nerf_lightning.nerf.types.scene import Scene
 
 READERS: dict[str, type[CaptureReader]] = {"llff": LlffReader, "colmap": ColmapReader, "transforms": TransformsReader}
 FLIP = np.diag([1.0, -1.0, -1.0])
-PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 8: 4, 9: 5}
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 

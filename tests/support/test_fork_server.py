@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import pytest
-from support.cold_import import cold_import
 from support.fork_server import PIPE, Forked, fits_a_fork
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere tests start processes of their own")
@@ -16,25 +15,6 @@ def told(code, *arguments, **options):
     process = Forked("-c", code, *arguments, **options)
     output, _ = process.communicate(timeout=60)
     return process.returncode, output
-
-
-@pytest.mark.exhaustive
-def test_it_has_imported_everything_and_computed_nothing():
-    code = """
-import sys, threading
-print(len(threading.enumerate()), open("/proc/self/status").read().split("Threads:")[1].split()[0])
-print({"nerf_lightning.commands.train", "numba", "lightning.pytorch", "hydra.main"} <= sys.modules.keys())
-print({"pytest", "_pytest", "conftest"} & sys.modules.keys())
-import logging
-print(logging.getLogger().handlers, logging.getLogger("nerf_lightning").handlers)
-"""
-    assert told(code) == (0, "1 1\nTrue\nset()\n[] []\n")
-
-
-def test_warnings_are_filtered_as_in_a_process_of_its_own(tmp_path_factory):
-    code = "import nerf_lightning.commands.train, warnings; print(*warnings.filters[-5:], sep='\\n')"
-    alone = cold_import(tmp_path_factory)[3:8]
-    assert told(code) == (0, "".join(f"{line}\n" for line in alone))
 
 
 def test_it_has_its_own_folder_environment_arguments_and_session(tmp_path, monkeypatch):

@@ -67,16 +67,6 @@ def test_a_dataclass_is_checked_when_it_is_made():
         Pair(torch.ones(3), torch.ones(3), 3)
 
 
-def test_axes_can_be_named_by_arguments():
-    @decorated
-    def drawn(count: int) -> Float[Tensor, "{count}"]:
-        return torch.ones(2)
-
-    assert drawn(2).shape == (2,)
-    with pytest.raises(TypeCheckError):
-        drawn(3)
-
-
 def test_values_that_decide_are_looked_at_each_time():
     @decorated
     def named(values: Float[Tensor, " n"], way: Literal["up", "down"]) -> list[Float[Tensor, " n"]]:
@@ -133,15 +123,3 @@ def test_what_passed_once_passes_again_and_nothing_else_does():
         with pytest.raises(TypeCheckError, match="more"):
             parts(torch.ones(3), "right", torch.ones(2))
     assert calls == 2 * ["right", "wrong"]
-
-
-def test_what_has_a_shape_need_not_be_an_array():
-    class Grid:
-        shape = (2, 3)
-
-    @decorated
-    def rows(grid: Grid, values: Float[Tensor, " n"]) -> Grid:
-        return grid
-
-    for _ in range(2):
-        assert rows(Grid(), torch.ones(3)).shape == (2, 3)

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import LensModel
 
 
@@ -103,3 +105,18 @@ def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
     if kinds & {"fisheye", "equirectangular"}:
         return None
     return "radial_tangential" if "radial_tangential" in kinds else "pinhole"
+
+
+def one_lens_model(kinds: set[LensModel], source: Path) -> LensModel:
+    """Return the model that holds all lenses of a capture; a pinhole where there are none.
+
+    Raises:
+        InputError: none does.
+    """
+    lens_model = common_lens_model(kinds)
+    if lens_model is None:
+        raise InputError(
+            f"{source} mixes lenses of several kinds ({listed(sorted(kinds))}), and a scene has one. Undistort the "
+            "photographs, or split the capture: one for each kind."
+        )
+    return lens_model

@@ -157,11 +157,11 @@ def named_picture(
     if named.suffix.lower() in HEIC_ENDINGS and "HEIF" not in decoders():  # a phone's JPEG beside it is read
         candidates = [*(named.with_suffix(ending) for ending in ENDINGS if ending not in HEIC_ENDINGS), *candidates]
     candidates += [named.with_name(named.name + ending) for ending in ENDINGS] if named.name else []
-    allowed = [
+    allowed = (
         path
         for path in candidates
         if inside is None or any(Path(os.path.abspath(path)).is_relative_to(each) for each in inside)
-    ]
+    )
     return next((path for path in allowed if path not in taken and is_there(path)), None)
 
 

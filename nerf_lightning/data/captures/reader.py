@@ -21,7 +21,7 @@ from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
-from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, image_size, orientation_of
+from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
@@ -112,10 +112,9 @@ class CaptureReader(Reader):
         with reading(self.root):
             capture = self.capture()
         capture = self._wanted(capture)
-        if capture.splits is None:  # before views are left out, so that the others keep their splits
-            train, held = (
-                every_kth(range(len(capture.views)), self.hold_every) if len(capture.views) > 1 else ((0,), ())
-            )
+        if capture.splits is None and len(capture.views) > 1:
+            # Before views are left out, so that the others keep their splits.
+            train, held = every_kth(range(len(capture.views)), self.hold_every)
             capture = replace(capture, splits={"train": train, "val": held, "test": held})
         capture = as_calibrated(usable(capture))
         capture = self._with_masks(capture)
@@ -177,9 +176,7 @@ class CaptureReader(Reader):
     def _located_folder(self) -> Path:
         folder = self.named_folder()
         found = located(folder, lambda path: path if self.found_in(path) else None)
-        if len(found) > 1:
-            choice = listed((f"scene.root={path}" for path in found), 4)
-            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
+        require_one(found, self.root)
         if found and found[0] != folder:
             log.info("%s holds no capture of scene=%s; %s, which does, is read", self.root, self.name, found[0])
         return found[0] if found else folder
@@ -241,7 +238,7 @@ class CaptureReader(Reader):
         """Return by what the photographs shrink."""
         if self.downscale != "auto":
             return self.downscale
-        longest = max(max(image_size(view.photograph.path)) for view in capture.views)
+        longest = max(max(upright_size(view.photograph)) for view in capture.views)
         factor = -(-longest // (MOST_AROUND if capture.lens_model == "equirectangular" else MOST_PIXELS))
         log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
         return factor
@@ -277,8 +274,8 @@ class CaptureReader(Reader):
         return capture.some(kept)
 
     def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
-        assert capture.splits is not None
-        splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
+        given = capture.splits or {"train": tuple(range(len(capture.views)))}
+        splits = {split: given.get(split, ()) for split in ("train", "val", "test")}
         names = [view.name for view in capture.views]
         splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
         if splits["train"] and not (splits["val"] or splits["test"]):
@@ -324,6 +321,13 @@ def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Fo
     return found
 
 
+def require_one(folders: Sequence[Path], root: str) -> None:
+    """Refuse a folder `root` that holds several captures."""
+    if len(folders) > 1:
+        choice = listed((f"scene.root={path}" for path in folders), 4)
+        raise InputError(f"{root} holds {len(folders)} captures. Choose one of them: {choice}.")
+
+
 def _folders_in(folder: Path) -> list[Path]:
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_dir())
@@ -353,9 +357,10 @@ def as_calibrated(capture: Capture) -> Capture:
     views, kept, turned = list(capture.views), [], []
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
-            orientation, (width, height) = orientation_of(view.photograph.path), image_size(view.photograph.path)
+            header = view.photograph.header or read_header(view.photograph.path)
+            orientation, (width, height) = header.orientation, header.size
             upright = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
-            views[number] = replace(view, photograph=replace(view.photograph, upright=upright))
+            views[number] = replace(view, photograph=replace(view.photograph, upright=upright, header=header))
             require_fit(view, *((height, width) if upright else (width, height)))
             kept.append(number)
             if orientation != 1:

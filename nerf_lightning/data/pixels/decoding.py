@@ -14,11 +14,12 @@ from torch import Tensor
 
 from nerf_lightning.data.pixels.images import (
     MaskColor,
+    PictureHeader,
     area_downscale,
     crop_to_multiple,
     downscaled_size,
     image_size,
-    orientation_of,
+    read_header,
     read_mask,
     read_rgba,
     whole_blocks,
@@ -56,11 +57,13 @@ class Photograph:
     mask_keeps: MaskColor = "white"
     upright: bool = False
     """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
+    header: PictureHeader | None = None
+    """Of the picture, where it was read already."""
 
 
 def upright_size(photograph: Photograph) -> tuple[int, int]:
     """Return (width, height) in pixels as the photograph is read."""
-    width, height = image_size(photograph.path)
+    width, height = (photograph.header or read_header(photograph.path)).size
     return (height, width) if photograph.upright else (width, height)
 
 
@@ -175,8 +178,9 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
     def size(index: int) -> tuple[int, int]:
         path, mask = photographs[index].path, photographs[index].mask
         width, height = upright_size(photographs[index])
-        if mask is not None and image_size(mask) not in ((width, height), image_size(path)):
-            across, down = image_size(mask)
+        sizes = ((width, height), (height, width)) if photographs[index].upright else ((width, height),)
+        if mask is not None and (of_mask := image_size(mask)) not in sizes:
+            across, down = of_mask
             raise InputError(
                 f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}. "
                 "Give the mask the photograph's own size; it is shrunk together with it."
@@ -191,10 +195,11 @@ def _mask(
 ) -> Bool[np.ndarray, "small_height small_width"]:
     if photograph.mask is None:
         return np.ones(size[::-1], dtype=np.bool_)
-    as_shown = photograph.upright and image_size(photograph.mask) != upright_size(photograph)
+    header = read_header(photograph.mask)
+    as_shown = photograph.upright and header.size != upright_size(photograph)
     kept = read_mask(photograph.mask, photograph.mask_keeps, as_shown)
-    if as_shown and orientation_of(photograph.mask) == 1:  # programs that make masks may drop the tag
-        kept = TURNED[orientation_of(photograph.path)](kept)
+    if as_shown and header.orientation == 1:  # programs that make masks may drop the tag
+        kept = TURNED[read_header(photograph.path).orientation](kept)
     kept = whole_blocks(kept, downscale)
     _check_unchanged(kept, size, photograph.mask)
     if not kept.any():

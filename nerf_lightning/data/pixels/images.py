@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache
 from io import BufferedReader
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
@@ -68,15 +68,34 @@ LARGE = 40_000_000
 _one_large_picture = threading.RLock()
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) in pixels from the file's header; no pixel is decoded.
+class PictureHeader(NamedTuple):
+    """What a picture file says of itself before its pixels."""
+
+    size: tuple[int, int]
+    """(width, height) in pixels as they are stored."""
+    orientation: int
+    """How the picture is to be turned for show, by EXIF: 1 (as it is stored) to 8; 1 where nothing sound is said."""
+
+
+def read_header(path: Path) -> PictureHeader:
+    """Return a picture's size and orientation; no pixel is decoded, and of a PNG nothing behind them is looked at.
 
     Raises:
         InputError: the file is absent, empty, of no known format, too large to be decoded safely, holds several
             pictures, or has a pixel mode with no plain reading as 8-bit colour.
     """
     with _opened(path) as image:
-        return image.size
+        try:
+            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else {}
+            orientation = exif.get(ORIENTATION, 1)
+        except DECODER_ERRORS:
+            orientation = 1
+        return PictureHeader(image.size, orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) in pixels; see `read_header`."""
+    return read_header(path).size
 
 
 def is_heic(path: Path) -> bool:
@@ -87,20 +106,6 @@ def is_heic(path: Path) -> bool:
     except (OSError, InputError):
         return False
     return start[4:8] == b"ftyp" and start[8:12] in HEIC_KINDS
-
-
-def orientation_of(path: Path) -> int:
-    """Return how a picture is to be turned for show, by EXIF: 1 (as it is stored) to 8; 1 where nothing sound is said.
-
-    Of a PNG only what stands before its pixels is looked at.
-    """
-    with _opened(path) as image:
-        try:
-            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else {}
-            turned = exif.get(ORIENTATION, 1)
-        except DECODER_ERRORS:
-            return 1
-    return turned if isinstance(turned, int) and 1 <= turned <= 8 else 1
 
 
 def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height width 4"]:
@@ -114,7 +119,7 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
         upright: turn the pixels as an EXIF tag says; false returns them as they are stored.
 
     Raises:
-        InputError: what `image_size` refuses, or damaged or truncated.
+        InputError: what `read_header` refuses, or damaged or truncated.
     """
     with _opened(path) as image:
         if _is_deep(image):
@@ -149,7 +154,7 @@ def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
     """Return the levels of a grey picture of 16 bits, as depth sensors write it.
 
     Raises:
-        InputError: what `image_size` refuses, damaged, or of another kind.
+        InputError: what `read_header` refuses, damaged, or of another kind.
     """
     with _opened(path) as image:
         if image.mode not in GREY_16:

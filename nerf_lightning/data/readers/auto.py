@@ -9,7 +9,7 @@ from typing import Any
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import contents
-from nerf_lightning.data.captures.reader import CaptureReader, located
+from nerf_lightning.data.captures.reader import CaptureReader, located, require_one
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
@@ -113,11 +113,9 @@ class AutoReader(CaptureReader):
         if (named := self._named_file()) is not None:
             return named
         found = located(folder, self.known_format)
-        if len(found) == 1:
-            return found[0]
+        require_one([known.folder for known in found], self.root)
         if found:
-            choice = listed((f"scene.root={known.folder}" for known in found), 4)
-            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
+            return found[0]
         formats = listed((Known(folder, "", reader).scene for reader in READERS), len(READERS))
         raise InputError(
             f"{self.root} holds no capture of a format that is known here ({formats}): it holds {contents(folder)}."

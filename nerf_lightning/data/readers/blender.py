@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.checks import check_step, contents, usable
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import cameras_of, decoded, require_fit
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.images import ENDINGS, image_size, read_rgba
+from nerf_lightning.data.pixels.decoding import upright_size
+from nerf_lightning.data.pixels.images import ENDINGS, read_rgba
 from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import GivenFrameReader
@@ -146,9 +147,7 @@ class BlenderReader(GivenFrameReader):
                 views[split].append(replace(found.view, name=name))
                 lenses.add(found.lens_model)
         left_out.require_enough(sum(map(len, views.values())))
-        lens_model = common_lens_model(lenses or {"pinhole"})
-        if lens_model is None:
-            raise InputError(f"{root} mixes lenses of several kinds ({listed(sorted(lenses))}). Split the capture.")
+        lens_model = one_lens_model(lenses, root)
         train, val, test = ([view.photograph.path for view in views[split]] for split in SPLITS)
         kept = set(apart(train, val, test, lambda image: image.name, self.root))
         views["train"] = [view for view in views["train"] if view.photograph.path in kept]
@@ -188,7 +187,7 @@ def _is_photographed(path: Path) -> bool:
 
 def _of_one_size(capture: Capture) -> tuple[Capture, tuple[int, int]]:
     """Return the views whose images have the most frequent (width, height), and that size."""
-    sizes = [image_size(view.photograph.path) for view in capture.views]
+    sizes = [upright_size(view.photograph) for view in capture.views]
     usual = Counter(sizes).most_common(1)[0][0]
     kept = []
     for number, (view, size) in enumerate(zip(capture.views, sizes, strict=True)):

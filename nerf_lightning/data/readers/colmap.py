@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, named_picture, pictures_below
 from nerf_lightning.data.captures.reader import CaptureReader
@@ -31,7 +31,7 @@ from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.files.links import is_absolute
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes, rotation_from_quaternion
+from nerf_lightning.nerf.geometry.poses import flip_yz, rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import LensModel
 
 # Which of its parameters are fx, fy, cx, cy, and which k1, k2, k3, k4, p1, p2; -1: none.
@@ -119,7 +119,7 @@ class ColmapReader(CaptureReader):
                 views.append(_view(image, camera, files[image.name]))
                 kept.append(image)
         left_out.require_enough(len(views))
-        lens_model = _lens_model({model.cameras[image.camera].model for image in kept}, folder)
+        lenses = {LAYOUTS[model.cameras[image.camera].model][0] for image in kept}
         taken = set(files.values())
         base = os.path.commonpath([path.parent for path in taken])
         others = [path for path in pictures_below(Path(base)) if path not in taken]
@@ -127,7 +127,7 @@ class ColmapReader(CaptureReader):
         return Capture(
             views=tuple(views),
             source=folder,
-            lens_model=lens_model,
+            lens_model=one_lens_model(lenses, folder),
             points=torch.from_numpy(model.points.positions),
             point_errors=torch.from_numpy(model.points.errors),
             tracks=torch.from_numpy(_tracks(kept, model.points)),
@@ -212,7 +212,7 @@ def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
     rotation = rotation_from_quaternion(torch.tensor(image.rotation, dtype=torch.float64))
     translation = torch.tensor(image.translation, dtype=torch.float64)
     center = -rotation.mT @ translation
-    return from_opencv_axes(torch.cat([rotation.mT, center[:, None]], dim=-1))
+    return flip_yz(torch.cat([rotation.mT, center[:, None]], dim=-1))
 
 
 def _require_known(camera: ColmapCamera, folder: Path) -> None:
@@ -226,16 +226,6 @@ def _require_known(camera: ColmapCamera, folder: Path) -> None:
         f"{listed(LAYOUTS, len(LAYOUTS))}. Undistort the photographs with `colmap image_undistorter`, or reconstruct "
         "with OPENCV (or OPENCV_FISHEYE)."
     )
-
-
-def _lens_model(used: set[str], folder: Path) -> LensModel:
-    lens_model = common_lens_model({LAYOUTS[name][0] for name in used})
-    if lens_model is None:
-        raise InputError(
-            f"{folder} mixes fisheye lenses or panoramas with others ({listed(sorted(used))}), and a scene has one "
-            "kind. Undistort the photographs with `colmap image_undistorter`, or split the capture."
-        )
-    return lens_model
 
 
 def models_in(root: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures, named_picture
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import is_absolute
@@ -128,14 +128,15 @@ def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, ever
 def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], picture: Path) -> FoundFrame:
     settings = file.content | {key: value for key, value in frame.items() if value is not None}
     lens_model, lens = lens_of(settings, where)
-    stored_width, stored_height = map(float, image_size(picture))
+    header = read_header(picture)
+    stored_width, stored_height = map(float, header.size)
     # The intrinsics may be those of another size.
     width, height = number_of(settings, "w", where, stored_width), number_of(settings, "h", where, stored_height)
     focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
     folder = file.path.parent
     view = View(
         name=picture.relative_to(folder if picture.is_relative_to(folder) else picture.anchor).as_posix(),
-        photograph=Photograph(picture),
+        photograph=Photograph(picture, header=header),
         c2w=pose_from_matrix(frame["transform_matrix"], f"{where}: transform_matrix"),
         focal=focal(settings, width, height, where),
         center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -22,7 +22,7 @@ from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular, read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes, is_rigid
+from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
 from nerf_lightning.nerf.types.scene import LensModel
 
 HEAD = 4096
@@ -92,9 +92,7 @@ class MetashapeReader(CaptureReader):
             log.warning("%s: the lens has %s, which is not known here and is left out", path, " and ".join(terms))
         posed = {view.name for view in views} | left_out.faults.keys()
         left_out.without_pose = tuple(label for label in labels if label not in posed)
-        lens_model = common_lens_model(lenses or {"pinhole"})
-        if lens_model is None:
-            raise InputError(f"{path} mixes lenses of several kinds ({listed(sorted(lenses))}). Export each alone.")
+        lens_model = one_lens_model(lenses, path)
         return Capture(tuple(views), path, lens_model, undo=_chunk_to_world(chunk, path), left_out=left_out)
 
     def _path(self, root: Path) -> Path:
@@ -172,7 +170,7 @@ def _view(camera: Element, label: str, sensor: Sensor, picture: Path, path: Path
     return View(
         name=label,
         photograph=Photograph(picture),
-        c2w=from_opencv_axes(c2w),
+        c2w=flip_yz(c2w),
         focal=sensor.focal,
         center=sensor.center,
         size=sensor.size,

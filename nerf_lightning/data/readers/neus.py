@@ -17,13 +17,13 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import archive_headers, read_member
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+from nerf_lightning.nerf.geometry.poses import flip_yz
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 MOST_BYTES = 1 << 28
@@ -99,12 +99,13 @@ def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, F
 
 def _view(picture: Path, name: str, projection: Float[ndarray, "3 4"], where: str) -> View:
     intrinsics, rotation, center = _decomposed(projection, where)
-    width, height = image_size(picture)
+    header = read_header(picture)
+    width, height = header.size
     c2w = torch.from_numpy(np.concatenate([rotation.T, center[:, None]], axis=1))
     return View(
         name=name,
-        photograph=Photograph(picture),
-        c2w=from_opencv_axes(c2w),
+        photograph=Photograph(picture, header=header),
+        c2w=flip_yz(c2w),
         focal=(float(intrinsics[0, 0]), float(intrinsics[1, 1])),
         center=(float(intrinsics[0, 2]), float(intrinsics[1, 2])),
         size=(float(width), float(height)),

@@ -17,11 +17,11 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+from nerf_lightning.nerf.geometry.poses import flip_yz
 
 MOST_BYTES = 1 << 16
 CURE = "Copy it again."
@@ -97,11 +97,12 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
             if not pose.is_file():
                 raise InputError(f"{pose} does not exist, so {name} has no pose.")
             intrinsics = _numbers(own if own.is_file() else folder / "intrinsics.txt")
-            (fx, fy, cx, cy), size = _intrinsics(intrinsics, image_size(picture))
+            header = read_header(picture)
+            (fx, fy, cx, cy), size = _intrinsics(intrinsics, header.size)
             yield View(
                 name=prefix + name,
-                photograph=Photograph(picture),
-                c2w=from_opencv_axes(pose_from_matrix(_numbers(pose)[:16], str(pose))),
+                photograph=Photograph(picture, header=header),
+                c2w=flip_yz(pose_from_matrix(_numbers(pose)[:16], str(pose))),
                 focal=(fx, fy),
                 center=(cx, cy),
                 size=size,

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.checks import contents, pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -65,21 +65,13 @@ class TransformsReader(CaptureReader):
         each = [views_of(file, self.folder(), self.allow_outside, left_out) for file in files]
         found = [frame for frames in each for frame in frames]
         left_out.require_enough(len(found))
-        lenses = {frame.lens_model for frame in found} or {"pinhole"}
-        lens_model = common_lens_model(lenses)
-        if lens_model is None:
-            mixed = "panoramas (EQUIRECTANGULAR)" if "equirectangular" in lenses else "fisheye lenses"
-            raise InputError(
-                f"{paths[0]} mixes {mixed} with others, and a scene has one kind. Split the capture: one file for each "
-                "kind, whose frames may share the photographs' folder."
-            )
         views = self._with_masks_and_depths(paths[0], found)
         left_out.without_pose = self._without_pose(views, left_out)
         undo = _undo_of(files)
         return Capture(
             views=tuple(views),
             source=paths[0],
-            lens_model=lens_model,
+            lens_model=one_lens_model({frame.lens_model for frame in found}, paths[0]),
             points=_points(files, self.folder(), self.allow_outside),
             splits=_splits(files[0], found)
             if len(files) == 1

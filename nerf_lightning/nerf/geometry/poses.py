@@ -17,8 +17,8 @@ def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[
     return finite & (off < tolerance) & (torch.linalg.det(torch.nan_to_num(rotation)) > 0)
 
 
-def from_opencv_axes(c2w: Float[Tensor, "*views 3 4"]) -> Float[Tensor, "*views 3 4"]:
-    """Return camera-to-world poses with axes right, down, ahead as poses with axes right, up, back."""
+def flip_yz(c2w: Float[Tensor, "*views 3 4"]) -> Float[Tensor, "*views 3 4"]:
+    """Turn camera-to-world poses with OpenCV's axes (right, down, ahead) into ours (right, up, back), and back."""
     return c2w * c2w.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 

@@ -13,19 +13,16 @@ from PIL import Image
 from support import malformed
 from support.budget import budget
 from support.captures import write_blender, write_npz
-from support.fuzzing import harmless
 from support.malformed import WRITERS, edit_json
-from support.posed_captures import Known, read, ring, write_colmap, write_transforms
+from support.posed_captures import Known, read, write_colmap
 from support.running import refused
 
 from nerf_lightning.data.captures import reader as capture_reader
-from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.checks import check_step, usable
+from nerf_lightning.data.captures.checks import check_step
 from nerf_lightning.data.captures.reader import picture_files
 from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
@@ -98,22 +95,6 @@ def test_folders_are_walked_as_python_does(tmp_path):
     assert list(walk(tmp_path / "absent")) == []
 
 
-def test_equal_names_are_found_in_one_pass(tmp_path):
-    class Name(str):
-        compared = 0
-
-        def __eq__(self, other):
-            Name.compared += 1
-            return str.__eq__(self, other)
-
-        __hash__ = str.__hash__
-
-    (view,) = TransformsReader(str(write_transforms(tmp_path / "c", Known(c2w=ring(1))))).capture().views
-    views = tuple(replace(view, name=Name("a.png")) for _ in range(1000))
-    assert len(usable(Capture(views, tmp_path / "a.json")).views) == 1
-    assert Name.compared < 5000
-
-
 def test_a_folder_whose_name_is_none(tmp_path):
     refused(BlenderReader("x" * 5000).read, parts=("does not exist",))
     refused(NpzReader("x" * 5000).read, parts=("does not exist",))
@@ -148,13 +129,6 @@ def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
 @pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
 def test_a_step_that_is_none(step):
     refused(check_step, "skip.train", step, parts=(f"scene.skip.train is {step}, but it must be 1",))
-
-
-def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
-    """Whoever looked back over all keys for each of them would take hours."""
-    keys = ", ".join(f'"{number}": 0' for number in range(200_000))
-    (tmp_path / "many.json").write_text(f'{{{keys}, "199999": 1}}')
-    assert harmless(read_json, tmp_path / "many.json") is None
 
 
 def test_a_tiff_with_the_cameras_settings(tmp_path):

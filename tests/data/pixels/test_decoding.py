@@ -1,4 +1,3 @@
-import itertools
 import json
 import os
 import shutil
@@ -16,7 +15,7 @@ from support.running import start_code
 from nerf_lightning.data.pixels import decoding as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
 from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
-from nerf_lightning.data.pixels.images import area_downscale, crop_to_multiple, read_rgba
+from nerf_lightning.data.pixels.images import PictureHeader, area_downscale, crop_to_multiple, read_rgba
 from nerf_lightning.messages.errors import InputError
 
 SIZES = [(9, 7), (8, 8), (6, 10)]
@@ -87,7 +86,7 @@ def test_the_second_call_decodes_nothing_and_opens_no_picture(capture, cache, mo
         raise AssertionError(path)
 
     monkeypatch.setattr(module, "read_rgba", fail)
-    monkeypatch.setattr(module, "image_size", fail)
+    monkeypatch.setattr(module, "read_header", fail)
     assert torch.equal(read(capture, cache).rgba, first)
     with pytest.raises(AssertionError):
         read(capture, cache, downscale=2)
@@ -341,7 +340,6 @@ def test_the_default_folder_follows_the_environment(capture, tmp_path, monkeypat
 
 
 def test_a_file_that_changes_while_it_is_read_is_noticed(capture, cache, monkeypatch):
-    sizes = itertools.repeat((4, 4))
-    monkeypatch.setattr(module, "image_size", lambda path: next(sizes))
+    monkeypatch.setattr(module, "read_header", lambda path: PictureHeader((4, 4), 1))
     with pytest.raises(InputError, match=r"(a.png|b.jpg|c.webp) changed while it was read"):
         read(capture, cache)

@@ -10,7 +10,7 @@ from support.decoders import without_heic
 
 from nerf_lightning.data.pixels import images
 from nerf_lightning.data.pixels.formats import FORMATS, decoders
-from nerf_lightning.data.pixels.images import image_size, orientation_of, read_rgba
+from nerf_lightning.data.pixels.images import image_size, read_header, read_rgba
 from nerf_lightning.data.sfm.photograph_folder import find_photographs, put_upright
 from nerf_lightning.messages.errors import InputError
 
@@ -47,7 +47,7 @@ def test_heic_is_read_as_a_phone_shows_it(heif, tmp_path):
     PHOTOGRAPH.save(tmp_path / "b.heic", exif=turned.tobytes(), **EXACT)
     assert differences(tmp_path / "a.heic", PHOTOGRAPH) <= 2
     assert image_size(tmp_path / "b.heic") == PHOTOGRAPH.size[::-1]
-    assert orientation_of(tmp_path / "b.heic") == 1
+    assert read_header(tmp_path / "b.heic").orientation == 1
     assert differences(tmp_path / "b.heic", PHOTOGRAPH.transpose(Image.Transpose.ROTATE_270)) <= 2
 
 

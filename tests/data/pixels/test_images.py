@@ -14,7 +14,7 @@ from nerf_lightning.data.pixels.images import (
     crop_to_multiple,
     downscaled_size,
     image_size,
-    orientation_of,
+    read_header,
     read_mask,
     read_rgba,
     whole_blocks,
@@ -209,7 +209,7 @@ def test_a_picture_is_read_as_it_is_stored_or_upright(tmp_path, ending):
         exif = Image.Exif()
         exif[0x0112] = tag
         Image.fromarray(rgb).save(path, exif=exif)
-        assert orientation_of(path) == orientation
+        assert read_header(path).orientation == orientation
     exif[0x0112] = 6
     Image.fromarray(rgb).save(path, exif=exif)
     stored = read_rgba(path)

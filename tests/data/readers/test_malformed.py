@@ -66,16 +66,14 @@ def mask(size):
 ROWS = [*frames_of(Known())[2]["transform_matrix"][:3], [0, 0, 1, 1]]
 AT_THE_END = [[1, 0, 0, 9e30], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 PATH = {"camera_type": "perspective", "render_height": 9, "camera_path": [], "fps": 24}
-ONE, TWO = ["images/p_0.png"], ["images/p_0.png", "images/p_1.png"]
+TWO = ["images/p_0.png", "images/p_1.png"]
 PANORAMA = {"camera_model": "EQUIRECTANGULAR"}
 JSON = "transforms.json"
 
 TRANSFORMS = {
     "no json": (lambda root: (root / JSON).unlink(), r"json does not exist; the folder holds images. Point scene.root"),
     "cut short": (text(JSON, lambda old: old[:-20]), r"json is not valid json: .* at line 1, column \d+. Export it"),
-    "brackets": (text(JSON, lambda _: b"[" * 100_000), r"transforms.json nests its brackets too deeply"),
     "ten thousand digits": (
         text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"),
         r"is not usable json: .*digits",
@@ -85,7 +83,6 @@ TRANSFORMS = {
         r"key 'fl_x' stands twice",
     ),
     "a thousand digits": (top(fl_x=10**1000), r"transforms.json: frames\[0\] .*: fl_x has too many digits"),
-    "digits in a pose": (frame(0, transform_matrix=[[10**400] * 4] * 4), r"frames\[0\].* is not a 4 x 4 matrix of num"),
     "a camera path": (content(lambda _: PATH), r"lacks frames; it has camera_type, .* A transforms.json of"),
     "a list": (content(lambda old: old["frames"]), r"must be a json object with the keys frames, but it is list"),
     "frames by name": (top(frames={"a": 1}), r"frames must be a list of views, but it is dict"),
@@ -98,8 +95,6 @@ TRANSFORMS = {
     "an image by number": (frame(2, file_path=7), r"frames\[2\]: file_path is 7, but it must be a path as text"),
     "a pose without its last row": (frame(2, transform_matrix=ROWS), r"frames\[2\].* does not end in the row 0 0 0 1"),
     "a pose of words": (frame(2, transform_matrix=[["a"] * 4] * 4), r"is not a 4 x 4 matrix of numbers"),
-    "a ragged pose": (frame(2, transform_matrix=[[1, 2], [3]]), r"is not a 4 x 4 matrix of numbers"),
-    "a pose of one number": (frame(2, transform_matrix=5), r"must be a 4 x 4 matrix, but it is a single number"),
     "a pose with NaN": (
         frame(2, transform_matrix=[[float("nan")] * 4] * 3),
         r"transform_matrix holds NaN or infinity: this view",
@@ -107,18 +102,15 @@ TRANSFORMS = {
     "a camera far away": (frame(0, transform_matrix=AT_THE_END), r"p_0.png has .*a centre beyond 1e\+09, where no"),
     "a frame twice": (frame(2, file_path="./images/p_1.png"), r"lists images/p_1.png more than once, with different p"),
     "fl_x of zero": (top(fl_x=0.0), r"the view images/p_0.png has the focal length 0, 20"),
-    "fl_x of next to nothing": (top(fl_x=1e-300, fl_y=1e-300), r"the focal length 1e-300, .* at least 0.001"),
     "intrinsics with NaN": (top(cx=float("nan")), r"the view images/p_0.png has a pose or intrinsics with NaN"),
     "numbers as text": (top(fl_x="20"), r"frames\[0\] .*: fl_x is '20', but it must be a number"),
     "no focal length": (top(fl_x=None, fl_y=None), r"has no focal length: neither fl_x \(pixels\) nor camera_angle_x"),
     "degrees": (top(fl_x=None, camera_angle_x=45.0), r"camera_angle_x is 45.0, but it must lie between 0 and pi"),
     "half a panorama": (top(camera_model="VR180_L"), r"has the camera_model 'VR180_L'; known are PINHOLE, .* export"),
-    "a list of models": (top(camera_model=["OPENCV"]), r"has the camera_model \['OPENCV'\]; known are"),
     "a panorama of more than a turn": (top(**PANORAMA, fl_x=5.0, fl_y=12.0), r"with fl_x=5 and fl_y=12 for 16 x 12"),
-    "a bent panorama": (top(**PANORAMA, k1=0.1), r"has the camera_model EQUIRECTANGULAR and distortion coefficients"),
     "a bent pinhole": (top(camera_model="PINHOLE", k1=0.1), r"has the camera_model PINHOLE and distortion"),
-    "a panorama among others": (frame(1, **PANORAMA, fl_x=8.0, fl_y=12.0), r"mixes panoramas \(EQUIRECTANGULAR\) with"),
-    "a fisheye among others": (frame(1, camera_model="OPENCV_FISHEYE", k1=0.1), r"mixes fisheye lenses with others"),
+    "a panorama among others": (frame(1, **PANORAMA, fl_x=8.0, fl_y=12.0), r"mixes lenses of several kinds \(equirect"),
+    "a fisheye among others": (frame(1, camera_model="OPENCV_FISHEYE", k1=0.1), r"mixes lenses of .*fisheye, pinhole"),
     "a tangential fisheye": (top(camera_model="OPENCV_FISHEYE", p1=0.1), r"The lens of images/p_0.png .*tangential"),
     "a mask by number": (frame(1, mask_path=3), r"of 1 files \(mask_path\) 1 are not there: 3"),
     "an absent mask": (frame(1, mask_path="a.png"), r"of 1 files \(mask_path\) 1 are not there: a.png"),
@@ -127,12 +119,9 @@ TRANSFORMS = {
     "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Mend it"),
     "nothing held out": (top(train_filenames=TWO), r"names no view to judge by that is there: every 8th"),
     "a shear": (top(applied_transform=SHEARED), r"applied_transform must turn, move and scale alike along all axes"),
-    "a mirror": (top(applied_transform=MIRRORED), r"applied_transform must turn, move and scale alike along all axes"),
     "words": (top(applied_transform="none"), r"applied_transform is not a 4 x 4 matrix of numbers"),
     "a scale of zero": (top(applied_scale=0.0), r"applied_scale is 0, but it must be above 0"),
     "tiny units": (top(applied_scale=1e18), r"in a frame whose unit is 4.6.*e-18 .* applied_scale"),
-    "huge units": (top(applied_scale=1e-18), r"in a frame whose unit is .* applied_scale"),
-    "ngp's scale of zero": (top(aabb_scale=2, scale=0), r"scale is 0, but it must be above 0"),
     "ngp's offset of two": (top(aabb_scale=2, offset=[0.5, 0.5]), r"offset is \[0.5, 0.5\], but must be three numbers"),
 }
 
@@ -171,14 +160,10 @@ LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
     "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
-    "cut in the header": (text(NPY, lambda old: old[:40]), NO_ARRAY),
     "empty": (text(NPY, lambda old: b""), NO_ARRAY),
     "an archive": (archived, NO_ARRAY),
     "pickled": (pickled, r"poses_bounds.npy is not an array of numbers .*Object arrays cannot be loaded"),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
-    "complex": (rows(lambda old: old + 1j), r"is 9 x 17 of complex128, but each view needs"),
-    "a number": (rows(lambda old: np.array(3.0)), r"is a single number of float64, but each view needs"),
-    "no rows": (rows(lambda old: old[:0]), r"has 0 poses, but \S+images has 9 photographs"),
     "a photograph missing": (lambda root: one_picture(root).unlink(), r"has 9 poses, but \S+images has 8 photographs"),
     "a photograph too many": (
         lambda root: write_pictures(root / "images", ("x.png",), (16, 12)),
@@ -189,7 +174,6 @@ LLFF = {
     "bounds exchanged": (cell(4, 15, 100.0), r"bounds.* are not used, since .* 1 of 9 .*p_4.png"),
     "a bound far away": (cell(EVERY, 16, 1e12), r"the content .* would reach .* the cameras' distance from the middle"),
     "a focal length of zero": (cell(EVERY, 14, 0.0), r"the view p_0.png has the focal length 0, 0 for 16 x 12 pixels"),
-    "a negative focal length": (cell(EVERY, 14, -20.0), r"the view p_0.png has the focal length -20, -20"),
     "mirrored poses": (
         rows(lambda old: np.where(np.isin(np.arange(17), [0, 5, 10]), -old, old)),
         r"not a rotation and",
@@ -255,7 +239,7 @@ COLMAP = {
     "half a model": (lambda root: (root / IMAGES).unlink(), r"holds cameras.bin but no images.bin: it is not whole"),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
-    "two kinds of lenses": (mixed, r"mixes fisheye lenses or .* \(OPENCV_FISHEYE, PINHOLE\), and a scene"),
+    "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
     "an empty model": (emptied, r"has no registered photograph, so nothing can be learnt. Copy the model again, or"),
     "a tail": (text(IMAGES, lambda old: old + b"tail"), r"images.bin goes on for 4 bytes after what it announces"),
     "files exchanged": (exchanged, r"(cameras|images).bin (ends after|goes on|holds)"),

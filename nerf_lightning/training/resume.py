@@ -1,6 +1,10 @@
-"""What training goes on from, held against the run that takes it up: its weights, optimizer, callbacks and loops."""
+"""What a checkpoint keeps of a run, what a resume restores of it, and what it is held against first.
+
+Lightning restores weights, optimizer, callbacks and loops; `restore_run` restores the rest.
+"""
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +13,12 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nerf_lightning.checkpoints.format import KEY, require_training_state
+from nerf_lightning.compute import ranks
+from nerf_lightning.compute.devices import use_threads
 from nerf_lightning.data.ray_batches import batch_sizes
 from nerf_lightning.files.trust import Mismatch, reading, require_fit, require_like
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.step import TrainStep
 
 CURE = (
     "Training cannot go on from it: take another one (resume=RUN_FOLDER takes the newest that is whole), or begin a "
@@ -24,6 +31,25 @@ RATES = ("lr", "base_lr")
 WAYS = ("fused", "foreach", "capturable")
 """How the same update is computed, which depends on the device."""
 Build = Callable[[Iterable[Any]], Optimizer]
+
+
+def run_state(step: TrainStep) -> dict[str, Any]:
+    """Return what a checkpoint keeps of a run beside its record, weights and optimizer."""
+    return {
+        "progress": asdict(step.progress),
+        "bad_steps": step.guard.state(),
+        "tile_points": step.tile_points,
+        "num_threads": torch.get_num_threads(),
+        "world_size": ranks.world_size(),
+    }
+
+
+def restore_run(state: Mapping[str, Any], step: TrainStep, device: torch.device) -> None:
+    """Take a run up where `run_state` left it; a sum's last bits depend on the number of threads."""
+    step.progress.take_up(Progress(**state["progress"]))
+    step.guard.restore(state["bad_steps"], device)
+    if state["world_size"] == ranks.world_size():
+        use_threads(state["num_threads"])
 
 
 def require_resumable(
