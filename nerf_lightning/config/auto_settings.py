@@ -23,6 +23,12 @@ EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
 
+SHORT_SECONDS = 100
+"""In less time, more and cheaper steps are worth more than finer grids and larger batches."""
+TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
+"""log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
+MANY_RAYS = 4096
+
 log = logging.getLogger(__name__)
 
 
@@ -37,39 +43,55 @@ def resolve_auto(
         InputError: a setting that is neither a value nor auto.
     """
     config = copy.deepcopy(config)
+    of_photos = choices.get("scene") == "photos"
+    seconds = config.budget.seconds
+    if seconds == AUTO:
+        seconds = PHOTOS_SECONDS if of_photos else None
     if choices.get("model") == AUTO:
         name, reason = model_for(scene)
         log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
         with_model = [*overrides, f"model={name}"]
         fitted, picked = compose_config("train", with_model)
-        if name == PHOTOGRAPHS and scene.depths is not None and picked["loss"] == "proposal":
-            fitted, picked = compose_config("train", [*with_model, *_for_depths(scene, overrides)])
+        if name == PHOTOGRAPHS and picked["loss"] == "proposal":
+            fitted, picked = compose_config("train", [*with_model, *_for_photographs(scene, overrides, seconds)])
         fitted.paths = config.paths
         config, choices = fitted, picked
-    of_photos = choices.get("scene") == "photos"
     _settle(config, "doctor", of_photos)
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
-        config.budget.seconds = PHOTOS_SECONDS if of_photos else None
+        config.budget.seconds = seconds
         if of_photos:
             log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
     return config, chosen(choices)
 
 
-def _for_depths(scene: Scene, overrides: Sequence[str]) -> list[str]:
-    """Return the loss and the grid that suit known depths; what a person has typed stays."""
-    typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
-    if "loss" in typed or scene.depths is None:
-        return []
-    log.info(
-        "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
-        f"{len(scene.depths):,}",
-    )
-    if "encoder" in typed:
-        return ["loss=depth"]
-    resolution, table = grid_for(scene)
-    log.info("encoder: %d cells a side, as small as the pixels (encoder.max_resolution=N)", resolution)
-    return ["loss=depth", f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
+def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | float | None) -> list[str]:
+    """Return the grid, the rays of a step and the loss that suit photographs; what a person has typed stays."""
+    typed = {re.split("[=@]", override.lstrip("+~"))[0] for override in overrides}
+    groups = {each.split(".")[0] for each in typed}
+    short = seconds is not None and seconds < SHORT_SECONDS
+    suited = []
+    if "encoder" not in groups:
+        pixels = grid_for(scene)
+        resolution = max(pixels // 2, 512) if short else pixels
+        table = 18 if short else TABLE_SIZES[resolution]
+        log.info(
+            "encoder: %d cells a side, %s, and tables of 2^%d (encoder.max_resolution=N, encoder.log2_table_size=N)",
+            resolution,
+            "as small as the pixels" if resolution == pixels else "twice as wide as the pixels for so short a training",
+            table,
+        )
+        suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
+    if "data.batch_rays" not in typed and not short:
+        suited.append(f"data.batch_rays={MANY_RAYS}")
+        log.info("data: %d rays a step, since there is time for them (data.batch_rays=N)", MANY_RAYS)
+    if "loss" not in groups and scene.depths is not None:
+        log.info(
+            "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
+            f"{len(scene.depths):,}",
+        )
+        suited.append("loss=depth")
+    return suited
 
 
 def resolve_correction(

@@ -54,8 +54,6 @@ CONTRACTED_SIDE = 4.0
 COARSEST_LEVEL, FINEST_LEVEL = 9, 12
 LEAST_DISTANCE = 0.1
 """Of a camera from what it shows, in units of the farthest camera's."""
-TABLE_SIZES = {512: 18, 1024: 19, 2048: 19, 4096: 20}
-"""log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
 IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
 """The models of model=auto."""
 
