@@ -128,12 +128,13 @@ def far_apart(found, expected):
 @pytest.mark.parametrize(
     ("matmul_precision", "most"), [("float32", 2e-4), pytest.param("bfloat16", 0.02, marks=needs_bfloat16)]
 )
-@pytest.mark.parametrize(("features", "color_layers"), [(2, 1), (4, 2)])
+@pytest.mark.parametrize(("features", "color_layers", "feature_dim"), [(2, 1, 16), (4, 2, 16), (4, 1, 4)])
 @pytest.mark.parametrize(("opaque_below", "bias"), [(0.0, 1.0), (1e-3, 4.0)])
 def test_it_sees_and_learns_what_the_single_kernels_do(
-    jitter, matmul_precision, most, features, color_layers, opaque_below, bias
+    jitter, matmul_precision, most, features, color_layers, feature_dim, opaque_below, bias
 ):
-    level = a_level(opaque_below, 32, features, matmul_precision, density_bias=bias, color_layers=color_layers)
+    sizes = {"color_layers": color_layers, "feature_dim": feature_dim}
+    level = a_level(opaque_below, 32, features, matmul_precision, density_bias=bias, **sizes)
     level.returns_weights = False
     rays, random = some_rays(700), batch_random(3, 700) if jitter else None
     weight, background = torch.randn(700, 8), torch.rand(700, 3)

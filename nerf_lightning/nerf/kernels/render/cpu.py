@@ -68,7 +68,9 @@ def render(
     levels = (*level_arrays(field.layout), (0,) * table.shape[1])
     limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
     networks = (*network(field.density_weights, dtype), *network(field.color_weights, dtype))
-    arrays = *along(rays, field, state, lattice, grid), table, levels, networks, limits
+    march, world, directions = along(rays, field, state, lattice, grid)
+    hidden = field.color_weights[0].shape[1] - directions.shape[1]
+    arrays = march, world, directions, hidden, table, levels, networks, limits
     kind = KINDS[dtype]
     over_rows(lambda first, last: _render(kind, first, last, *arrays, arrays_of(out)), count)
     return out
@@ -198,7 +200,7 @@ def _add_colors(kind, count, inputs, words, packed, dims, sums, owner, weight, f
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _render(kind, first, last, march, world, directions, table, levels, networks, limits, out):
+def _render(kind, first, last, march, world, directions, hidden, table, levels, networks, limits, out):
     resolutions, offsets, hashed, mask, lanes = levels
     density_words, dims, color_words, color_dims = networks
     bias, least_alpha, opaque_below = limits
@@ -213,7 +215,7 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
     # Of the samples whose colours are asked for together.
     inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
     between = np.zeros((ROWS, color_dims[:-1].sum() * size // 4), np.int32)
-    colors, hidden = np.zeros((ROWS, color_dims.max()), np.float32), color_dims[0] - directions.shape[1]
+    colors, given = np.zeros((ROWS, color_dims.max()), np.float32), hidden + directions.shape[1]
     live, waiting, asked = 0, first, 0
     while True:
         live = _go_on(march, live, ray, sample_index, light, opaque_below)
@@ -238,7 +240,7 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
             depth[r] += w * HALF * (begin[s] + stop[s])
             if alpha > least_alpha:
                 inputs[asked, :hidden] = flat[s * outer : s * outer + hidden]
-                inputs[asked, hidden:] = directions[r]
+                inputs[asked, hidden:given] = directions[r]
                 owner[asked], weight[asked] = r, w
                 asked += 1
             if asked == ROWS:

@@ -120,7 +120,8 @@ class _Given:
     ):
         self.field, self.kind, self.dtype = field, KINDS[dtype], dtype
         self.march, self.world, self.directions = along(rays, field, state, lattice, grid)
-        self.limits = np.float32(field.bias), np.float32(opaque_below)
+        self.hidden = field.color_weights[0].shape[1] - self.directions.shape[1]
+        self.limits = np.float32(field.bias), np.float32(opaque_below), self.hidden
         self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
         self.workspaces: list[Workspace] = []
@@ -165,8 +166,7 @@ class _Given:
             workspace, end, count = self.workspaces[number], int(ends[number]), self.used[number] * ROWS
             totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
             slope = np.float32(self.field.least_slope)
-            hidden = widths[1][0] - self.directions.shape[1]
-            given = self.parts[number], self.used[number], hidden, networks, slope, arrays, workspace.arrays()
+            given = self.parts[number], self.used[number], self.hidden, networks, slope, arrays, workspace.arrays()
             _go_back(self.kind, *given, features[end - count : end].numpy(), *totals)
             points[end - count : end] = workspace.points[:count]
 
@@ -259,7 +259,7 @@ def _end(live, end, opaque_below, ray, sample_index, light):
 def _see(kind, first, last, march, world, directions, table, levels, networks, limits, room, out):
     resolutions, offsets, hashed, mask, lanes = levels
     density_words, dims, color_words, color_dims = networks
-    bias, opaque_below = limits
+    bias, opaque_below, hidden = limits
     foreground, opacity, depth = out
     all_owners, all_numbers, all_points, density_kept, color_kept = room
     ray, sample_index, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
@@ -267,7 +267,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     lengths, distances, rooms = np.zeros(ROWS, np.float32), np.zeros(ROWS, np.float32), new_rooms()
     inputs = np.zeros((ROWS, color_dims[0]), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
-    flat, hidden = sums.reshape(-1), color_dims[0] - directions.shape[1]
+    flat, given = sums.reshape(-1), hidden + directions.shape[1]
     stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
     live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
     while True:
@@ -288,7 +288,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
         asked += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
         for i in range(count):
             inputs[i, :hidden] = flat[i * dims[-1] : i * dims[-1] + hidden]
-            inputs[i, hidden:] = directions[ray[slots[i]]]
+            inputs[i, hidden:given] = directions[ray[slots[i]]]
         x = address(color_kept) + block * ROWS * color_stride
         round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
         through(kind, x, color_stride, address(color_words), color_dims, y, y)
