@@ -24,11 +24,9 @@ PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
 
 SHORT_SECONDS = 100
-"""In less time, more and cheaper steps are worth more than finer grids and larger batches."""
+"""In less time, more and cheaper steps are worth more than finer grids."""
 TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 """log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
-MANY_RAYS = 4096
-
 log = logging.getLogger(__name__)
 
 
@@ -52,7 +50,7 @@ def resolve_auto(
         log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
         with_model = [*overrides, f"model={name}"]
         fitted, picked = compose_config("train", with_model)
-        if name == PHOTOGRAPHS and picked["loss"] == "proposal":
+        if name == PHOTOGRAPHS:
             fitted, picked = compose_config("train", [*with_model, *_for_photographs(scene, overrides, seconds)])
         fitted.paths = config.paths
         config, choices = fitted, picked
@@ -66,12 +64,11 @@ def resolve_auto(
 
 
 def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | float | None) -> list[str]:
-    """Return the grid, the rays of a step and the loss that suit photographs; what a person has typed stays."""
-    typed = {re.split("[=@]", override.lstrip("+~"))[0] for override in overrides}
-    groups = {each.split(".")[0] for each in typed}
+    """Return the grid and the loss that suit photographs; what a person has typed stays."""
+    typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
     short = seconds is not None and seconds < SHORT_SECONDS
     suited = []
-    if "encoder" not in groups:
+    if "encoder" not in typed:
         pixels = grid_for(scene)
         resolution = max(pixels // 2, 512) if short else pixels
         table = 18 if short else TABLE_SIZES[resolution]
@@ -82,10 +79,7 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
             table,
         )
         suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
-    if "data.batch_rays" not in typed and not short:
-        suited.append(f"data.batch_rays={MANY_RAYS}")
-        log.info("data: %d rays a step, since there is time for them (data.batch_rays=N)", MANY_RAYS)
-    if "loss" not in groups and scene.depths is not None:
+    if "loss" not in typed and scene.depths is not None:
         log.info(
             "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
             f"{len(scene.depths):,}",

@@ -30,7 +30,7 @@ def chosen_for(scene, *overrides):
 
 @pytest.mark.parametrize(
     ("scene", "model", "batch_rays"),
-    [(IN_A_BOX, "fast", 4096), (PHOTOGRAPHS, "fast_proposal", 4096), (FORWARD_FACING, "fast_proposal", 4096)],
+    [(IN_A_BOX, "fast", 4096), (PHOTOGRAPHS, "fast_proposal", 2048), (FORWARD_FACING, "fast_proposal", 2048)],
 )
 def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_rays):
     caplog.set_level("INFO")
@@ -69,14 +69,14 @@ def test_a_box_and_a_capture_without_depths_are_trained_on_colours_alone(scene):
 def test_without_depths_the_pixels_are_as_wide_as_at_the_middle_of_the_scene():
     sharp = replace(PHOTOGRAPHS.cameras, focal=PHOTOGRAPHS.cameras.focal * 100.0)  # 1,920 pixels, seen from 4 units
     config, _ = chosen_for(replace(PHOTOGRAPHS, cameras=sharp))
-    assert (config.encoder.max_resolution, config.encoder.log2_table_size, config.data.batch_rays) == (2048, 19, 4096)
+    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (2048, 19)
 
 
-def test_a_short_training_takes_a_coarser_grid_and_smaller_steps(caplog):
+def test_a_short_training_takes_a_coarser_grid(caplog):
     caplog.set_level("INFO")
     sharp = replace(PHOTOGRAPHS.cameras, focal=PHOTOGRAPHS.cameras.focal * 100.0)
     config, _ = chosen_for(replace(PHOTOGRAPHS, cameras=sharp), "budget.seconds=60")
-    assert (config.encoder.max_resolution, config.encoder.log2_table_size, config.data.batch_rays) == (1024, 18, 2048)
+    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (1024, 18)
     assert "twice as wide as the pixels for so short a training" in caplog.text
 
 
