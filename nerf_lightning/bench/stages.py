@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from nerf_lightning.compute.machine import seconds_of
+from nerf_lightning.compute.machine import seconds_of, torch_threads
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.kernels.backends import without
@@ -31,7 +31,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     optimizer.zero_grad()
     whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
-    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=rays.origins.requires_grad):
+    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=step.rays.refinement.moves()):
         return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
         points = ragged_points(rays, sampler(rays, None), None)
@@ -106,6 +106,7 @@ def flops_per_ray(step: TrainStep, batch: Batch) -> float:
     # Where rays differ in their samples, many make the mean.
     few = 8 if step.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
-    with FlopCounterMode(display=False) as counter, without("mlp.cpu", "render.gradients"):  # it sees torch's alone
+    kernels = "mlp.cpu", "render.gradients", "render.dense"  # it sees torch's own operations, of its own thread
+    with torch_threads(1), FlopCounterMode(display=False) as counter, without(*kernels):
         step.gradients(rays)
     return counter.get_total_flops() / few

@@ -136,7 +136,7 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         rows[label] = 1e3 * one / steps if count == 1 else one / more
     if len(threads) > 1:  # Amdahl's law: t_n / t_1 = s + (1 - s) / n
         count, share = threads[-1], seconds[f"train on {threads[-1]}"] / seconds["train on 1"]
-        rows["share of a step that takes one thread alone"] = (count * share - 1.0) / (count - 1.0)
+        rows["share of a step that takes one thread alone"] = ((count * share - 1.0) / (count - 1.0)).clip(0.0, 1.0)
     return rows, flops
 
 

@@ -21,6 +21,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.corrections.none import NoCorrection
 from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
@@ -319,6 +320,7 @@ class TrainStep:
             except RuntimeError as error:
                 if not is_out_of_memory(error):
                     raise
+                forget_workspaces()
                 self._take_smaller_tiles(batch, error)
             for part in self.parts.values():
                 part.zero_grad(set_to_none=False)

@@ -149,9 +149,12 @@ class NGPField(Field):
         return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
-        """Return what kernels of whole rays compute with; None while the encoder does not look up a grid alone."""
-        grid = self.position_encoder.grid()
-        if grid is None or type(self) is not NGPField:  # a class of another name may compute something else
+        """Return what kernels of whole rays compute with; None while the encoder does not look up a grid alone.
+
+        Where hooks want to see what the field is asked, nothing passes it by.
+        """
+        grid, hooks = self.position_encoder.grid(), (*self._forward_hooks, *self._forward_pre_hooks)
+        if grid is None or hooks or type(self) is not NGPField:  # a class of another name may compute something else
             return None
         return FieldParts(
             self.aabb,

@@ -45,8 +45,7 @@ def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
     another program has one of the cores for a moment, all of them wait, which made steps four times as slow.
 
     Args:
-        shares_out: False: that takes one, too.
-
+        shares_out: whether `in_parallel` still uses several threads.
     """
     former, threads = _kept.threads, torch.get_num_threads()
     _kept.threads = num_threads() if shares_out else 1
@@ -61,22 +60,27 @@ def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
 
 
 def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """Do the work on each part, on as many threads as torch has here, and return the results in order.
+    """Do the work on each part, on `num_threads()` threads, and return the results in order.
 
     The calling thread takes parts, too, so that small work is done before another thread has woken up. Within a part
-    torch has one thread, and so has whatever is called there. Raises what the work raises.
+    torch has one thread, and so has whatever is called there. Of the caller's settings, those of gradients hold in each
+    thread, and no others. Raises what the work raises, and takes no further parts then.
     """
     threads = min(num_threads(), len(parts))
     if threads < 2:
         return [work(part) for part in parts]
-    numbers, results = itertools.count(), [None] * len(parts)
+    numbers, results, failed = itertools.count(), [None] * len(parts), []  # type: ignore[var-annotated]
     # A thread's own settings, which those of the pool do not share.
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
 
     def take_parts() -> None:
         with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            while (number := next(numbers)) < len(parts):
-                results[number] = work(parts[number])  # type: ignore[call-overload]
+            while (number := next(numbers)) < len(parts) and not failed:
+                try:
+                    results[number] = work(parts[number])  # type: ignore[call-overload]
+                except BaseException:
+                    failed.append(number)
+                    raise
 
     others = [_pool(num_threads() - 1).submit(take_parts) for _ in range(threads - 1)]
     try:

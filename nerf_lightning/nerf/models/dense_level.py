@@ -68,7 +68,8 @@ class DenseLevel(Level):
         """
         samples = self.sampler(rays, history, random)
         whole_from = 0.0 if random is None else self.gradient_scaling_distance
-        parts = self._parts_on(rays.near.device)
+        plain = rays.near.dim() != 1 or rays.near.dtype != torch.float32
+        parts = None if plain else self._parts_on(rays.near.device)
         if parts is not None:
             weights, foreground = render_dense_rays(
                 rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from

@@ -64,7 +64,9 @@ class RaggedLevel(Level):
     ) -> Rendering | None:
         device, matmul_precision, sampler = rays.near.device, self.field.matmul_precision, self.sampler
         trains = torch.is_grad_enabled()
-        if not (evaluates or trains) or not self.takes_whole_rays(device, trains, rays.origins.requires_grad):
+        # Learnt focal lengths and lenses turn directions alone.
+        moved = any(each.requires_grad for each in (rays.origins, rays.directions, rays.view_directions))
+        if not (evaluates or trains) or not self.takes_whole_rays(device, trains, moved):
             return None
         parts = self.field.parts()
         march = sampler.marcher(rays).grid_march() if evaluates else sampler.grid_march(rays, random)

@@ -14,6 +14,7 @@ from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
+from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import FEWEST_ROWS, PARTS_PER_THREAD, in_parallel, threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -170,6 +171,7 @@ def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slic
         except RuntimeError as error:
             if at_once == 1 or not is_out_of_memory(error):
                 raise
+        forget_workspaces()
         model.most_rays = at_once = at_once // 2
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
 

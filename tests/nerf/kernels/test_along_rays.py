@@ -103,3 +103,9 @@ def test_exponentials_of_what_is_no_number_are_none():
     assert np.isnan(out[0])
     assert out[1] > 1e38
     assert out[2] < 1e-37
+
+
+def test_nothing_is_divided_by_to_an_exception():
+    assert not sample_histogram(torch.tensor([[0.0, 1.0]]), torch.zeros(1, 1), torch.tensor([[0.5]]), 0.0).isinf().any()
+    folding = torch.tensor([[-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])  # 1 + k r^2 is 0 at r = 1
+    assert not unproject(torch.tensor([[1.0, 0.0]]), folding, "radial_tangential")[:, :2].isfinite().all()

@@ -158,7 +158,7 @@ def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):
     weight = torch.randn(300, 8)
     seen, gradients = learnt(level, rays, None, weight)
     monkeypatch.setattr(workspace, "_spare", [])
-    monkeypatch.setattr(kernels, "SPARE_BLOCKS", 1)
+    monkeypatch.setattr(kernels, "SPARE_ROWS", 128)
     monkeypatch.setattr(level, "points_per_ray", lambda before, training: 0.0)
     again, of_again = learnt(level, rays, None, weight)
     assert torch.equal(seen, again)
@@ -192,6 +192,8 @@ def test_it_goes_the_other_way_where_something_else_is_wanted():
     level.returns_weights = False
     assert level.takes_whole_rays(cpu, training=True, learns_cameras=False)
     assert not level.takes_whole_rays(cpu, training=True, learns_cameras=True)
+    turns = replace(rays, directions=rays.directions.clone().requires_grad_())  # a focal length that is learnt
+    assert isinstance(level(turns, None, [], None), RaggedRendering)
     assert not isinstance(level(rays, None, [], None), RaggedRendering)
     with torch.no_grad():
         assert isinstance(level(rays, None, [], batch_random(0, 50)), RaggedRendering)

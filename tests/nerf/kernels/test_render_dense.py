@@ -153,6 +153,9 @@ def test_fields_that_the_kernel_does_not_know_take_the_plain_way():
     blends.field.position_encoder = HashGridEncoder(4, 4, 8, 2, 16, blend_in=0.5)
     blends.field.position_encoder.on_step(StepContext(0.1, 0, 0))
     assert not blends.takes_whole_rays(cpu, training=True, learns_cameras=False)
+    hooked = a_level()
+    hooked.field.register_forward_pre_hook(lambda *given: None)
+    assert not hooked.takes_whole_rays(cpu, training=True)
     other = a_level(type("Other", (DenseLevel,), {"field_output": lambda self, points: self.field(points)}))
     assert not other.takes_whole_rays(cpu, training=True, learns_cameras=False)
 
@@ -163,7 +166,7 @@ def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
     monkeypatch.setattr(workspace, "_spare", [])
     level.update(1, 0)
     assert not level(rays, None, [], batch_random(0, 30)).weights.requires_grad
-    assert [each.blocks for each in workspace._spare] == [1]
+    assert [each.rows for each in workspace._spare] == [128]
     level.update(4, 0)
     assert level(rays, None, [], batch_random(0, 30)).weights.requires_grad
 
@@ -173,3 +176,32 @@ def test_the_first_rays_may_be_those_of_a_picture(mode, monkeypatch):
     monkeypatch.setattr(backends, "backend", backends.backend.__wrapped__)
     with mode():
         assert a_level().takes_whole_rays(torch.device("cpu"), training=False)
+
+
+def test_rays_of_any_shape_are_rendered():
+    level, rays = a_level(contraction=True), some_rays(12)
+    grid, flat = rays.map(lambda each: each.view(3, 4, *each.shape[1:])), level(rays, None, [], None)
+    torch.testing.assert_close(level(grid, None, [], None).rgb.view(12, 3), flat.rgb, atol=1e-5, rtol=1e-4)
+    assert level(rays.map(lambda each: each[0]), None, [], None).rgb.shape == (3,)
+
+
+def test_a_second_way_back_is_refused():
+    seen = a_level()(some_rays(5), None, [], None).rgb.sum()
+    seen.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="sent back already"):
+        seen.backward()
+
+
+def test_learnt_rays_that_are_no_numbers_read_nothing_beyond_the_table():
+    level, rays = a_level(contraction=True), some_rays(20)
+    broken = replace(rays, directions=torch.full_like(rays.directions, torch.nan).requires_grad_())
+    level(broken, None, [], None).weights.nan_to_num().sum().backward()
+
+
+def test_few_workspaces_wait(monkeypatch):
+    monkeypatch.setattr(workspace, "_spare", [])
+    monkeypatch.setattr(workspace, "MOST_BYTES", 3 * workspace.Workspace.of(128, 8, 0).bytes)
+    workspace.give_back([workspace.Workspace.of(128, 8, 0) for _ in range(5)])
+    assert len(workspace._spare) == 3
+    workspace.forget_workspaces()
+    assert not workspace._spare

@@ -104,7 +104,7 @@ def level_arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
 @no_type_check
 def _cell(coordinate, resolution):
     scaled = min(max(coordinate, np.float32(0.0)), ONE) * np.float32(resolution)
-    cell = min(np.int32(scaled), np.int32(resolution - 1))
+    cell = max(min(np.int32(scaled), np.int32(resolution - 1)), NONE)  # whatever the coordinate is
     return cell, np.float32(scaled - np.float32(cell))
 
 

@@ -85,7 +85,7 @@ def _spaced(distance, contracted):
     return HALF * distance if distance < ONE else ONE - HALF / distance
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _sample(first, last, edges, weights, u, floor, contracted, out):
     bins = weights.shape[1]
@@ -107,7 +107,7 @@ def _sample(first, last, edges, weights, u, floor, contracted, out):
             out[r, k] = at
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _interlevel(first, last, v, t, w, u, out, grad):
     bins, samples = v.shape[1], w.shape[1]
@@ -132,7 +132,7 @@ def _interlevel(first, last, v, t, w, u, out, grad):
         out[r] = loss
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _distortion(first, last, contracted, w, edges, out, grad):
     samples, at = w.shape[1], np.empty(w.shape[1] + 1, np.float32)

@@ -23,7 +23,7 @@ def trial() -> None:
         undistort(torch.zeros(1, 2, dtype=dtype), torch.zeros(1, 6, dtype=dtype), 1)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _undistort(first, last, plane, lens, steps, out):
     number = plane.dtype.type

@@ -198,7 +198,7 @@ def _add_colors(kind, count, inputs, words, packed, dims, sums, owner, weight, f
             foreground[owner[i], c] += weight[i] / (ONE + math.exp(-flat[i * outer + c]))
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _render(kind, first, last, march, world, directions, hidden, table, levels, networks, limits, out):
     resolutions, offsets, hashed, mask, lanes = levels

@@ -43,8 +43,8 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
-OWN_FLOATS = np.float32(0)
-"""Tells `round_vector` to copy."""
+COPY = np.float32(0)
+"""Tells `round_vector` to round to float32, which is to copy."""
 
 
 def render(
@@ -75,7 +75,10 @@ def render(
 
 
 def trial() -> None:
-    """Run the kernels once on next to nothing, for the widths that conf/model uses; it raises what compilers raise."""
+    """Run the kernels once on next to nothing; it raises what compilers raise.
+
+    In the precision that training takes here by itself: those of the other are compiled by its first step.
+    """
     origins, along = torch.zeros(2, 3, requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
     rays = RayBundle(origins, along, torch.zeros(2), torch.ones(2), along)
     aabb, edges = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.linspace(0.0, 1.0, 4).expand(2, 4)
@@ -148,7 +151,7 @@ class _Call:
 
         def part(bounds: tuple[int, int]) -> Workspace:
             blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS) if self.keep else 1
-            workspace = take_workspace(blocks, (words[0], words[1]))
+            workspace = take_workspace(blocks * ROWS, (words[0], words[1]))
             kept = workspace.arrays()[1:]
             _forward(self.kind, *bounds, self.keep, space, of_rays, grid, networks, numbers, kept, shown)
             return workspace
@@ -172,6 +175,8 @@ class _Call:
             weights: of both perceptrons.
             grads: of what `forward` returned.
         """
+        if not self.workspaces:
+            raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
         density, color = self.split(weights)
         widths = padded_widths(density), padded_widths(color) if color else []
         counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
@@ -225,7 +230,7 @@ class _DenseRays(torch.autograd.Function):
         return None, *of_rays, of_table, *of_weights
 
 
-@njit(fastmath={"contract"})
+@njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
 def _place(space, first, start, count, block, points):
     # Which ray each sample of a block is on, and its distance, length and place, in the unit cube.
@@ -274,7 +279,7 @@ def _copy_numbers(source, target, count):
     # Whole vectors while there are any.
     done = 0
     while count - done >= LANES:
-        round_vector(OWN_FLOATS, source + 4 * done, target + 4 * done)
+        round_vector(COPY, source + 4 * done, target + 4 * done)
         done += LANES
     return done
 
@@ -299,7 +304,7 @@ def _new_block():
     return np.zeros(ROWS, np.int64), floats[0], floats[1], floats[2], floats[3], floats[4]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of_call, kept, out):
     table, resolutions, offsets, hashed, mask, lanes = grid
@@ -399,7 +404,7 @@ def _move_rays(count, contracted, block, toward, of_origins, of_directions):
         of_directions[r, 2] += t[i] * gz
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, kept, out, totals):
     table, resolutions, offsets, hashed, mask, lanes = grid

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 LOWEST, HIGHEST = np.float32(-87.0), np.float32(88.0)
-"""Beyond which a float32 is 0, or infinite."""
+"""What arguments are clamped to: a float32 holds no more."""
 PER_LN2, LN2, LN2_REST = np.float32(1.4426950408889634), np.float32(0.693359375), np.float32(-2.12194440e-4)
 ONE, HALF = np.float32(1.0), np.float32(0.5)
 FIFTH, FOURTH, THIRD = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
@@ -17,7 +17,7 @@ NEAR_ZERO = np.float32(0.01)
 SIXTH = np.float32(1.0 / 6.0)
 
 
-@njit(fastmath={"contract"})
+@njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
 def exponentials(x, out, bits):
     """Write e^x of each number of x; `bits` is room for as many int32. What is not a number stays that."""
@@ -34,7 +34,7 @@ def exponentials(x, out, bits):
         out[i] *= powers[i]
 
 
-@njit(fastmath={"contract"})
+@njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
 def absorbed(thickness, out, bits):
     """Write 1 - e^-x of each number x >= 0, exact near 0; `thickness` is overwritten, `bits` is room."""
@@ -47,7 +47,7 @@ def absorbed(thickness, out, bits):
         out[i] = near if x < NEAR_ZERO else ONE - out[i]
 
 
-@njit(fastmath={"contract"})
+@njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
 def sigmoids(x, out, bits):
     """Write 1 / (1 + e^-x) of each number; x is overwritten, `bits` is room."""

@@ -62,7 +62,7 @@ HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 SLOTS = 64
 """So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
 asked about in vain."""
-SPARE_BLOCKS, FEWEST_RAYS = 8, 64
+SPARE_ROWS, FEWEST_RAYS = 8 * ROWS, 64
 
 
 def render(
@@ -96,7 +96,7 @@ def render(
 
 
 def trial() -> None:
-    """Run the kernels once on next to nothing; it raises whatever their compiler raises."""
+    """Run the kernels once on next to nothing, in the precision that training takes here by itself."""
     for rays, field, state, lattice, grid in trial_arguments():
         for dtype in dtypes()[-1:]:
             field.table.requires_grad_()
@@ -138,13 +138,13 @@ class _Given:
         of_density, of_color = (words_of(sum(padded_widths(weights)[:-1]), self.dtype) for weights in (density, color))
 
         def part(bounds: tuple[int, int]) -> tuple[Workspace, int, int]:
-            blocks = SPARE_BLOCKS + int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS
+            rows = SPARE_ROWS + ROWS * (int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS)
             while True:
-                workspace = take_workspace(blocks, (of_density, of_color))
+                workspace = take_workspace(rows, (of_density, of_color))
                 used, asked = _see(self.kind, *bounds, *given, workspace.arrays(), arrays_of(out))
-                if used <= workspace.blocks:
+                if used * ROWS <= workspace.rows:
                     return workspace, used, asked
-                blocks = 2 * workspace.blocks
+                rows = 2 * workspace.rows
                 for each in out:
                     each[bounds[0] : bounds[1]] = 0.0
 
@@ -156,6 +156,8 @@ class _Given:
         self, density: list[Tensor], color: list[Tensor], grads: tuple[Tensor, ...]
     ) -> tuple[list[Tensor], Tensor, Tensor]:
         """Return the gradients of the weights; and all points, with the gradients of their features."""
+        if not self.workspaces:
+            raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
         networks, arrays = self.networks(density, color, True), arrays_of(grads)
         widths = padded_widths(density), padded_widths(color)
         counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
@@ -254,7 +256,7 @@ def _end(live, end, opaque_below, ray, sample_index, light):
     return live
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _see(kind, first, last, march, world, directions, table, levels, networks, limits, room, out):
     resolutions, offsets, hashed, mask, lanes = levels
@@ -321,7 +323,7 @@ def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, f
         behind[r - first] += w * g
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, features, of_density, of_color):
     density_words, dims, color_words, color_dims = networks

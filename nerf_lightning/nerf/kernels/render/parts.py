@@ -15,14 +15,14 @@ class FieldParts:
     """A hash grid, and two perceptrons without biases: density, and colour by what that hands on."""
 
     aabb: Float[Tensor, "2 3"]
-    """The box, outside of which there is nothing; where space is contracted, what is not."""
+    """The box, outside of which there is nothing. Where space is contracted, the box whose inside stays as it is."""
     table: Float[Tensor, "entries features"]
     layout: HashGridLayout
     bias: float
     """Added to the raw density, before the exponential."""
     density_weights: list[Tensor]
     color_weights: list[Tensor]
-    """Of the colour's; its inputs are the density's outputs and what all samples of a ray share. None: no colours."""
+    """Of the colour's; its inputs are the density's outputs and what a ray's samples share. Empty: density only."""
     ray_features: Callable[[RayBundle], Float[Tensor, "rays features"]]
     """Return what all samples of a ray share: the features of its direction, and a photograph's code."""
     least_slope: float = 0.0

@@ -1,6 +1,6 @@
 """Rays rendered from end to end in one kernel: the one front of these kernels, for any level that offers its rays.
 
-There are kernels for levels that march through an occupancy grid, and for those with as many samples on each ray.
+There are kernels for levels that march through an occupancy grid, and for those with equally many samples on every ray.
 """
 
 from typing import Any, NamedTuple
@@ -56,7 +56,8 @@ def has_dense_kernel(field: FieldParts | None, matmul_precision: MatmulPrecision
 
 def _has(module: str, field: FieldParts, matmul_precision: MatmulPrecision, device: torch.device) -> bool:
     perceptrons = cpu_backend("mlp.cpu", device) if is_on(module) else None
-    if perceptrons is None or field.table.dtype != torch.float32:
+    numbers = (field.table, *field.density_weights, *field.color_weights)
+    if perceptrons is None or any(each.dtype != torch.float32 for each in numbers):
         return False
     if not all(perceptrons.takes(each, _dtype(matmul_precision), pads=True) for each in field.weights if each):
         return False

@@ -1,5 +1,6 @@
 """Memory for what the backward pass of whole rays needs; steps take it from one another, since fresh memory is slow."""
 
+import os
 import threading
 from dataclasses import dataclass
 
@@ -7,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.mlp.cpu import ROWS
-
 NUMBERS = 8
 """Of each sample (`render.quadrature`)."""
+MOST_BYTES = 1 << 28
+"""Of what waits for a step to take it."""
 
 
 @dataclass
 class Workspace:
-    """What the forward pass leaves behind of some blocks of ROWS samples."""
+    """What the forward pass leaves behind of some samples."""
 
     owners: Tensor
     """Number of each sample's ray; negative: none."""
@@ -27,9 +28,8 @@ class Workspace:
     color_words: Tensor
 
     @classmethod
-    def of(cls, blocks: int, density_words: int, color_words: int) -> "Workspace":
-        """Return one for so many blocks, with so many words per sample."""
-        rows = blocks * ROWS
+    def of(cls, rows: int, density_words: int, color_words: int) -> "Workspace":
+        """Return one for so many samples, with so many words for each."""
         return cls(
             torch.empty(rows, dtype=torch.int32),
             torch.empty(rows, NUMBERS),
@@ -44,34 +44,54 @@ class Workspace:
         return self.density_words.shape[1], self.color_words.shape[1]
 
     @property
-    def blocks(self) -> int:
-        """How many there is room for."""
-        return self.owners.shape[0] // ROWS
+    def rows(self) -> int:
+        """How many samples there is room for."""
+        return self.owners.shape[0]
+
+    @property
+    def bytes(self) -> int:
+        """How much memory it takes."""
+        return sum(each.numel() * each.element_size() for each in self._tensors())
 
     def arrays(self) -> tuple[np.ndarray, ...]:
         """Return what the kernels take."""
-        tensors = self.owners, self.numbers, self.points, self.density_words, self.color_words
-        return tuple(each.numpy() for each in tensors)
+        return tuple(each.numpy() for each in self._tensors())
 
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return self.owners, self.numbers, self.points, self.density_words, self.color_words
 
-MOST_SPARE = 32
 
 _spare: list[Workspace] = []
-_spare_lock = threading.Lock()
+_lock = threading.Lock()
 
 
-def take_workspace(blocks: int, size: tuple[int, int]) -> Workspace:
-    """Return a workspace that nobody uses, for at least so many blocks."""
-    with _spare_lock:
+def take_workspace(rows: int, size: tuple[int, int]) -> Workspace:
+    """Return a workspace that nobody uses, for at least so many samples."""
+    with _lock:
         for number, spare in enumerate(_spare):
-            if spare.size == size and spare.blocks >= blocks:
+            if spare.size == size and spare.rows >= rows:
                 return _spare.pop(number)
-        # Of another field, or too small: what is no longer asked for must not stay.
-        _spare[:] = [spare for spare in _spare if spare.size != size][-MOST_SPARE:]
-    return Workspace.of(blocks, *size)
+    return Workspace.of(rows, *size)
 
 
 def give_back(workspaces: list[Workspace]) -> None:
-    """Let others use them."""
-    with _spare_lock:
+    """Let others use them; those that have waited longest are let go where there are too many."""
+    with _lock:
         _spare.extend(workspaces)
+        while sum(each.bytes for each in _spare) > MOST_BYTES:
+            _spare.pop(0)
+
+
+def forget_workspaces() -> None:
+    """Let go of all that nobody uses: there is no memory left."""
+    with _lock:
+        _spare.clear()
+
+
+def _renew_lock() -> None:
+    global _lock
+    _lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)  # another thread of the parent may have held it
