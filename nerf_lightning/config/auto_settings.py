@@ -25,6 +25,8 @@ PHOTOS_SECONDS = 300
 
 SHORT_SECONDS = 100
 """In less time, more and cheaper steps are worth more than finer grids."""
+FEW_PHOTOGRAPHS = 30
+"""To train on: fewer tell no finer grid what is true, unless known distances do."""
 TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 """log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
 log = logging.getLogger(__name__)
@@ -67,15 +69,17 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
     """Return the grid and the loss that suit photographs; what a person has typed stays."""
     typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
     short = seconds is not None and seconds < SHORT_SECONDS
+    few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
     suited = []
     if "encoder" not in typed:
         pixels = grid_for(scene)
-        resolution = max(pixels // 2, 512) if short else pixels
+        resolution = max(pixels // 2, 512) if short or few else pixels
         table = 18 if short else TABLE_SIZES[resolution]
+        cause = "so short a training" if short else "so few photographs without known distances"
         log.info(
             "encoder: %d cells a side, %s, and tables of 2^%d (encoder.max_resolution=N, encoder.log2_table_size=N)",
             resolution,
-            "as small as the pixels" if resolution == pixels else "twice as wide as the pixels for so short a training",
+            "as small as the pixels" if resolution == pixels else f"twice as wide as the pixels for {cause}",
             table,
         )
         suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]

@@ -66,18 +66,27 @@ def test_a_box_and_a_capture_without_depths_are_trained_on_colours_alone(scene):
     assert config.encoder.max_resolution == 512
 
 
-def test_without_depths_the_pixels_are_as_wide_as_at_the_middle_of_the_scene():
-    sharp = replace(PHOTOGRAPHS.cameras, focal=PHOTOGRAPHS.cameras.focal * 100.0)  # 1,920 pixels, seen from 4 units
-    config, _ = chosen_for(replace(PHOTOGRAPHS, cameras=sharp))
-    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (2048, 19)
-
-
-def test_a_short_training_takes_a_coarser_grid(caplog):
-    caplog.set_level("INFO")
+def seen_sharply(photographs=30):
+    """Pictures of 1,920 pixels in focal length, whose cameras stand 4 units from the middle."""
     sharp = replace(PHOTOGRAPHS.cameras, focal=PHOTOGRAPHS.cameras.focal * 100.0)
-    config, _ = chosen_for(replace(PHOTOGRAPHS, cameras=sharp), "budget.seconds=60")
-    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (1024, 18)
-    assert "twice as wide as the pixels for so short a training" in caplog.text
+    train = PHOTOGRAPHS.splits["train"]
+    splits = PHOTOGRAPHS.splits | {"train": tuple(train[number % len(train)] for number in range(photographs))}
+    return replace(PHOTOGRAPHS, cameras=sharp, splits=splits)
+
+
+@pytest.mark.parametrize(
+    ("photographs", "overrides", "grid", "said"),
+    [
+        (30, (), (2048, 19), "as small as the pixels"),
+        (30, ("budget.seconds=60",), (1024, 18), "twice as wide as the pixels for so short a training"),
+        (29, (), (1024, 18), "twice as wide as the pixels for so few photographs without known distances"),
+    ],
+)
+def test_without_depths_pixels_are_as_wide_as_at_the_middle_of_the_scene(caplog, photographs, overrides, grid, said):
+    caplog.set_level("INFO")
+    config, _ = chosen_for(seen_sharply(photographs), *overrides)
+    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == grid
+    assert said in caplog.text
 
 
 def test_a_loss_and_a_grid_that_are_typed_stay():
