@@ -22,13 +22,13 @@ AUTO = "auto"
 EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
-
 SHORT_SECONDS = 100
 """In less time, more and cheaper steps are worth more than finer grids."""
 FEW_PHOTOGRAPHS = 30
 """To train on: fewer tell no finer grid what is true, unless known distances do."""
 TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 """log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
+
 log = logging.getLogger(__name__)
 
 

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel, render_whole_rays
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
@@ -55,22 +56,27 @@ class RaggedLevel(Level):
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether a kernel takes rays from end to end: in training without weights and gradients of rays."""
+        return self._parts_on(device, training, learns_cameras) is not None
+
+    def _parts_on(self, device: torch.device, training: bool, learns_cameras: bool) -> FieldParts | None:
+        """Return the field's parts where there is a kernel for them."""
         if device.type != "cpu" or (training and (self.returns_weights or learns_cameras)):
-            return False  # on other devices the field's parts would be read
-        return has_kernel(self.field.parts(), self.field.matmul_precision, device, gradients=training)
+            return None  # on other devices reading the parts would wait for the device
+        parts = self.field.parts()
+        return parts if has_kernel(parts, self.field.matmul_precision, device, gradients=training) else None
 
     def _whole_rays(
         self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None, evaluates: bool
     ) -> Rendering | None:
-        device, matmul_precision, sampler = rays.near.device, self.field.matmul_precision, self.sampler
+        matmul_precision, sampler = self.field.matmul_precision, self.sampler
         trains = torch.is_grad_enabled()
         # Learnt focal lengths and lenses turn directions alone.
         moved = any(each.requires_grad for each in (rays.origins, rays.directions, rays.view_directions))
-        if not (evaluates or trains) or not self.takes_whole_rays(device, trains, moved):
+        parts = self._parts_on(rays.near.device, trains, moved) if evaluates or trains else None
+        if parts is None:
             return None
-        parts = self.field.parts()
         march = sampler.marcher(rays).grid_march() if evaluates else sampler.grid_march(rays, random)
-        if parts is None or march is None:
+        if march is None:
             return None
         expected = None if evaluates else self.points_per_ray(1.0, training=True)
         found = render_whole_rays(rays, parts, march, matmul_precision, sampler.opaque_below, LEAST_ALPHA, expected)

@@ -8,6 +8,7 @@ from itertools import pairwise
 import llvmlite.binding as llvm
 import pytest
 import torch
+from support.comparing import far_apart
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
@@ -51,10 +52,6 @@ def reference(points, weights, grad):
         if number:
             flowing = rounded(flowing * (inputs[number] > 0))
     return [out, flowing, *grads]
-
-
-def far_apart(found, expected):
-    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 @pytest.mark.parametrize("rows", ROWS)

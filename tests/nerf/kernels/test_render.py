@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.comparing import far_apart
 from support.ragged_levels import a_level, needs_bfloat16
 from support.scenes import some_rays
 
@@ -118,10 +119,6 @@ def learnt(level, rays, random, weight, background=None):
     shown = torch.cat([seen.rgb, seen.foreground, seen.opacity[:, None], seen.depth[:, None]], dim=1)
     (shown * weight).sum().backward()
     return shown.detach(), {name: each.grad.clone() for name, each in level.named_parameters()}
-
-
-def far_apart(found, expected):
-    return float((found - expected).norm() / expected.norm().clamp(min=1e-20))
 
 
 @pytest.mark.parametrize("jitter", [True, False])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.comparing import far_apart
 from support.ragged_levels import needs_bfloat16
 from support.scenes import some_rays
 
@@ -43,10 +44,6 @@ def learnt(level, rays, random, grads, background):
     (shown * grads).sum().backward()
     gradients = {name: each.grad for name, each in level.named_parameters() if each.grad is not None}
     return shown.detach(), gradients | {"origins": leaves[0].grad, "directions": leaves[1].grad}
-
-
-def far_apart(found, expected):
-    return float((found - expected).norm() / expected.norm().clamp(min=1e-20))
 
 
 def compare(level, rays, most, random=None, background=None):

@@ -69,8 +69,7 @@ def render(
     limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
     networks = (*network(field.density_weights, dtype), *network(field.color_weights, dtype))
     march, world, directions = along(rays, field, state, lattice, grid)
-    hidden = field.color_weights[0].shape[1] - directions.shape[1]
-    arrays = march, world, directions, hidden, table, levels, networks, limits
+    arrays = march, world, directions, field.handed_over(directions.shape[1]), table, levels, networks, limits
     kind = KINDS[dtype]
     over_rows(lambda first, last: _render(kind, first, last, *arrays, arrays_of(out)), count)
     return out

@@ -90,9 +90,8 @@ def trial() -> None:
         field = FieldParts(
             aabb, table, layout, 0.0, density, color, lambda rays: torch.ones(len(rays.near), 16), contracted=True
         )
-        for dtype in dtypes()[-1:]:
-            weights, foreground = render(rays, edges, field, dtype, False, 1.0)
-            (weights.sum() + foreground.sum()).backward()
+        weights, foreground = render(rays, edges, field, dtypes()[-1], False, 1.0)
+        (weights.sum() + foreground.sum()).backward()
 
 
 @dataclass
@@ -146,7 +145,12 @@ class _Call:
         out = torch.empty(self.rays, self.samples), torch.zeros(self.rays, 3)
         words = [words_of(sum(padded_widths(each)[:-1]), self.dtype) if each else 0 for each in (density, color)]
         space, grid, networks = self.space(origins, directions), self.grid(table), self.networks(weights, False)
-        numbers = np.float32(self.field.bias), np.float32(self.whole_from), self.closed, _handed_over(color, features)
+        numbers = (
+            np.float32(self.field.bias),
+            np.float32(self.whole_from),
+            self.closed,
+            self.field.handed_over(features.shape[1]),
+        )
         of_rays, shown = arrays_of((features.float(),))[0], arrays_of(out)
 
         def part(bounds: tuple[int, int]) -> Workspace:
@@ -185,7 +189,7 @@ class _Call:
         points, of_points = torch.empty(self.rays * self.samples, 3), torch.empty(self.rays * self.samples, found)
         of_rays = [torch.zeros(each.shape) for each in rays]
         space, grid, networks = self.space(*rays[:2]), self.grid(table), self.networks(weights, transposed=True)
-        numbers = np.float32(self.field.least_slope), _handed_over(color, rays[2]), wants_rays
+        numbers = np.float32(self.field.least_slope), self.field.handed_over(rays[2].shape[1]), wants_rays
         out, of_light = arrays_of((points, of_points, *of_rays)), arrays_of(tuple(each.float() for each in grads))
 
         def part(number: int) -> None:
@@ -202,11 +206,6 @@ class _Call:
         of_rays[0] *= self.scale
         of_rays[1] *= self.scale
         return of_rays, points, of_points, of_weights
-
-
-def _handed_over(color: list[Tensor], features: Tensor) -> int:
-    """Return how many of its outputs the density's perceptron hands to the colours'."""
-    return color[0].shape[1] - features.shape[1] if color else 0
 
 
 class _DenseRays(torch.autograd.Function):
@@ -373,9 +372,8 @@ def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
     # From the gradients of the colours' inputs to those of what the density's perceptron gave, and of what rays share.
     flat[: ROWS * outer] = ZERO
     for i in range(count):
-        for c in range(
-            _copy_numbers(address(passed) + 4 * i * passed.shape[1], address(flat) + 4 * i * outer, hidden), hidden
-        ):
+        given, to = address(passed) + 4 * i * passed.shape[1], address(flat) + 4 * i * outer
+        for c in range(_copy_numbers(given, to, hidden), hidden):
             flat[i * outer + c] = passed[i, c]
         flat[i * outer] += of_density[i]
         r = owner[i]

@@ -98,10 +98,9 @@ def render(
 def trial() -> None:
     """Run the kernels once on next to nothing, in the precision that training takes here by itself."""
     for rays, field, state, lattice, grid in trial_arguments():
-        for dtype in dtypes()[-1:]:
-            field.table.requires_grad_()
-            light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtype, 1.0)
-            (light.sum() + opacity.sum() + depth.sum()).backward()
+        field.table.requires_grad_()
+        light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtypes()[-1], 1.0)
+        (light.sum() + opacity.sum() + depth.sum()).backward()
 
 
 class _Given:
@@ -120,7 +119,7 @@ class _Given:
     ):
         self.field, self.kind, self.dtype = field, KINDS[dtype], dtype
         self.march, self.world, self.directions = along(rays, field, state, lattice, grid)
-        self.hidden = field.color_weights[0].shape[1] - self.directions.shape[1]
+        self.hidden = field.handed_over(self.directions.shape[1])
         self.limits = np.float32(field.bias), np.float32(opaque_below), self.hidden
         self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)

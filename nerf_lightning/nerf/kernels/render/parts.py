@@ -32,6 +32,10 @@ class FieldParts:
     ray_features_learn: bool = False
     """Whether there is anything to learn in `ray_features`."""
 
+    def handed_over(self, shared: int) -> int:
+        """Return how many outputs of the density are inputs of the colours, of which `shared` belong to the ray."""
+        return self.color_weights[0].shape[1] - shared if self.color_weights else 0
+
     @property
     def weights(self) -> tuple[list[Tensor], list[Tensor]]:
         """Of both perceptrons."""
