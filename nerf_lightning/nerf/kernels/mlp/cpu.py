@@ -190,7 +190,6 @@ def _multiply(kind, x, next_row, next_word, w, y, width, rows, words, adds):
 @no_type_check
 def _multiply_by_tiles(kind, x, next_row, w, y, width, rows, words, adds):
     row = 4 * width
-    open_tiles(kind)
     for r in range(0, rows, 2 * TILE):
         for c in range(0, width, 2 * TILE):
             from_x, from_w, into = x + r * next_row, w + 4 * c, y + r * row + 4 * c
@@ -203,7 +202,6 @@ def _multiply_by_tiles(kind, x, next_row, w, y, width, rows, words, adds):
                 multiply_tiles(kind, 1, 2, from_x, next_row, from_w, into, row, words, adds)
             else:
                 multiply_tiles(kind, 1, 1, from_x, next_row, from_w, into, row, words, adds)
-    close_tiles(kind)
 
 
 @njit(nogil=True, cache=True)
@@ -276,6 +274,7 @@ def _turn(source, rows, width, target):
 def through(kind, x, stride, w, dims, y, into):
     """Send ROWS rows through all layers: numbers at x, with room for all layers' inputs; the end goes to `into`."""
     layers, size = len(dims) - 1, bytes_of(kind)
+    open_tiles(kind)
     for layer in range(layers):
         inner, outer = dims[layer], dims[layer + 1]
         last = layer == layers - 1
@@ -283,6 +282,7 @@ def through(kind, x, stride, w, dims, y, into):
         x, w = x + size * inner, w + size * inner * outer
         if not last:
             _activate(kind, y, outer, x, stride)
+    close_tiles(kind)
 
 
 @njit
@@ -305,6 +305,7 @@ def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inp
         into: where.
     """
     size, before, numbers = bytes_of(kind), 0, 0
+    open_tiles(kind)
     for layer in range(len(dims) - 1):
         before, numbers = before + dims[layer], numbers + dims[layer] * dims[layer + 1]
     for layer in range(len(dims) - 2, -1, -1):
@@ -326,6 +327,7 @@ def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inp
             _pass_back(kind, y, inner, inputs, stride, dy)
         elif wants_inputs:
             _multiply(kind, dy, size * outer, 4, words, into, inner, ROWS, outer * size // 4, 0)
+    close_tiles(kind)
 
 
 @njit(nogil=True, cache=True)
