@@ -194,7 +194,7 @@ RECORDS = {
     ),
     "no views": (recorded(view_names=()), "of 0 views"),
     "views alike": (recorded(view_names=("a",) * 6), "view_names names two views alike"),
-    "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "2,000 characters in a name"),
+    "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "more than 1024 characters"),
     "a terminal's name": (recorded(view_names=("a\x1b[2J", *"bcdef")), "which holds control characters"),
     "other views": (recorded(splits={"train": (0, 99)}), "splits.train names views that are not among the 6"),
     "nothing to train on": (recorded(splits={"test": (0,)}), "splits has no views to train on"),

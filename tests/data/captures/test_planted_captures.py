@@ -243,10 +243,13 @@ def bombs(tmp_path):
     root = WRITERS["text"](tmp_path / "lines")
     (root / MODEL / "points3D.txt").write_bytes(b"\n" * 4 * MEGABYTE + b"1 x\n")
     yield "colmap", root, "should hold 3 numbers"
-    for name, text in (("deep", "[" * 10**6), ("nested", '{"frames": ' + "[" * 500 + "]" * 500 + "}")):
+    for name, text, words in (
+        ("deep", "[" * 10**6, "nests its brackets too deeply"),
+        ("nested", '{"frames": ' + "[" * 500 + "]" * 500 + "}", "frames"),
+    ):
         root = WRITERS["transforms"](tmp_path / name)
         (root / "transforms.json").write_text(text)
-        yield "transforms", root, "nests its brackets too deeply"
+        yield "transforms", root, words
     root = WRITERS["transforms"](tmp_path / "long")
     with (root / "transforms.json").open("r+b") as file:
         file.truncate(20_000_000_000)
