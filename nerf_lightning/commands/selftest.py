@@ -72,7 +72,7 @@ def _rows(settings: TrainerSettings) -> list[Row]:
         try:
             checks = [
                 *kernels.checks(device, precisions),
-                *training.checks(device, precisions, settings.compile or settings.device_type == "cuda"),
+                *training.checks(device, precisions),
                 *command_line.checks(runs, device, chosen),
             ]
             return [carried_out(check) for check in track(checks, transient=True, console=stderr_console())]
