@@ -35,7 +35,6 @@ OURS = {
     "selftest/command_line.py": ["read_text"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_text"],
-    "commands/selftest.py": ["read_text"],
     "cli/worker.py": ["load", "load"],
 }
 # For writing, in a folder of its own, or of what was opened by us.
