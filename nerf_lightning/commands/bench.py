@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
-from nerf_lightning.bench.callbacks import watching_seconds
 from nerf_lightning.bench.kernels import compared_kernels
 from nerf_lightning.bench.prepared import Bench, prepare
 from nerf_lightning.bench.stages import (
@@ -35,7 +34,6 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_console
-from nerf_lightning.training.callbacks.watcher import Watcher
 
 MOST_STEPS = 2000
 Work = Callable[[], Any]
@@ -126,10 +124,6 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
     stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
     for name in stages[0]:
         rows[f"{name}, share of a step"] = np.array([each[name] for each in stages]) * steps / train
-    watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
-    watching = watching_seconds(watchers, bench.step, bench.optimizer, bench.data, bench.batch)
-    rows["watching, share of a step"] = sum(watching.values()) * steps / train
-    rows |= {f"watching: {name}, share of a step": value * steps / train for name, value in watching.items()}
     for count in threads:
         label = "training on 1 thread, milliseconds" if count == 1 else f"training on {count} threads, times one"
         one, more = seconds["train on 1"], seconds[f"train on {count}"]
