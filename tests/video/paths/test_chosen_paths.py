@@ -43,7 +43,7 @@ def keys(tmp_path):
     return keyframe_file(
         tmp_path,
         Keyframe((5.0, 2.0, 4.0), look_at=(1.0, 2.0, 3.0)),
-        Keyframe((1.0, 7.0, 5.0), direction=(0.0, -3.0, -1.0), fov=60.0),
+        Keyframe((1.0, 7.0, 5.0), look_at=(1.0, 4.0, 4.0), fov=60.0),
         Keyframe((-4.0, 2.0, 3.0), look_at=(1.0, 2.0, 3.0), up=(0.1, 0.0, 1.0)),
     )
 
