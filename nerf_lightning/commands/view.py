@@ -8,7 +8,7 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.auth import names_of
-from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
+from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -35,8 +35,6 @@ def run(config: DictConfig) -> None:
     page = Page(queue, Photographs(record, scene, background), folder, *where)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C ends it)")
-    if config.open_browser:
-        open_in_browser(page.address)
     try:
         while not stopped:
             queue.work_or_wait()

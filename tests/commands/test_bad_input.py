@@ -119,13 +119,6 @@ def test_a_full_disk_outside_checkpoints_is_one_paragraph(nerf, last, tmp_path, 
     assert stop.value.code == 2
 
 
-def test_batch_norm_trains_whole_batches_and_no_tiles(train):
-    said(train("field.batch_norm=true"), "field.batch_norm=true", "trainer.tile_points=null")
-    whole = ("field.batch_norm=true", "trainer.tile_points=null")
-    result = train(*whole, "trainer.max_steps=2", "final.video=false", "final.evaluate=false")
-    assert result.code == 0, result.err
-
-
 def test_a_loss_that_is_not_a_number(train):
     result = train("optimizer.lr=1e38", "trainer.max_steps=50")
     said_lines = [line for line in result.err.splitlines() if line.startswith("nerf: ")]

@@ -309,7 +309,7 @@ def test_curves_stand_in_the_table_and_in_its_page(table, tmp_path):
     run = leave_measured_run(tmp_path / "runs" / "a")
     writer = SummaryWriter(str(run / "tensorboard"))
     for step in range(10):
-        writer.add_scalar("train/psnr_fine", 10.0 + step, 50 * step)
+        writer.add_scalar("PSNR/train_fine", 10.0 + step, 50 * step)
     writer.close()
     leave_measured_run(tmp_path / "runs" / "b", origin={"config": "b"})
     result, rows = table("published=false")
