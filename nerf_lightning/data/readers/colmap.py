@@ -29,6 +29,7 @@ from nerf_lightning.data.readers.colmap_files import (
 )
 from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.files.links import is_absolute
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, rotation_from_quaternion
@@ -243,12 +244,13 @@ def models_in(root: Path) -> list[Path]:
 def _number_of_images(folder: Path) -> int:
     """Return how many photographs a model has; 0 where its list is absent or damaged, which is said if it is read."""
     try:
-        return max(
-            kind.number_of_images(path)
-            for ending, kind in KINDS.items()
-            if (path := folder / f"images{ending}").is_file()
-        )
-    except (InputError, ValueError):
+        with reading(folder):
+            return max(
+                kind.number_of_images(path)
+                for ending, kind in KINDS.items()
+                if (path := folder / f"images{ending}").is_file()
+            )
+    except InputError:
         return 0
 
 
@@ -271,12 +273,15 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
     if not images_path.is_file():
         raise InputError(f"{folder} holds {cameras_path.name} but no {images_path.name}: it is not whole. {CURE}")
     files = KINDS[ending]
-    cameras = list(files.cameras(cameras_path))
+    with reading(cameras_path, CURE):
+        cameras = list(files.cameras(cameras_path))
     twice = [number for number, count in Counter(camera.number for camera in cameras).items() if count > 1]
     if twice:
         raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
-    images = sorted(files.images(images_path), key=lambda image: image.name)
-    points = files.points(points_path) if points_path.exists() else NO_POINTS
+    with reading(images_path, CURE):
+        images = sorted(files.images(images_path), key=lambda image: image.name)
+    with reading(points_path, CURE):
+        points = files.points(points_path) if points_path.exists() else NO_POINTS
     if points is NO_POINTS and (folder / PLY).is_file():
         points = read_ply_points(folder / PLY)
     return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
