@@ -155,14 +155,14 @@ def first_alone(root):
 
 EVERY = slice(None)
 NPY = "poses_bounds.npy"
-NO_ARRAY = r"poses_bounds.npy is not an array of numbers as numpy saves it"
+NO_ARRAY = r"poses_bounds.npy cannot be read \(ValueError"
 LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
     "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
     "empty": (text(NPY, lambda old: b""), NO_ARRAY),
     "an archive": (archived, NO_ARRAY),
-    "pickled": (pickled, r"poses_bounds.npy is not an array of numbers .*Object arrays cannot be loaded"),
+    "pickled": (pickled, r"poses_bounds.npy cannot be read \(ValueError: Object arrays cannot be loaded"),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
     "a photograph missing": (lambda root: one_picture(root).unlink(), r"has 9 poses, but \S+images has 8 photographs"),
     "a photograph too many": (
@@ -216,10 +216,6 @@ def exchanged(root):
     b.write_bytes(old)
 
 
-def twin(**changed):
-    return lambda root: write_colmap(root, Known(**changed), ".txt")
-
-
 def point(x):
     record = struct.pack("<Q3d3BdQ", 1, x, 0, 0, 1, 1, 1, 0.1, 0)
     return lambda root: (root / MODEL / "points3D.bin").write_bytes(struct.pack("<Q", 1) + record)
@@ -232,11 +228,13 @@ def swap(old, new):
 IMAGES = MODEL / "images.bin"
 FEATURES = struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a.png\0" + struct.pack("<Q", (1 << 64) - 1) + bytes(100)
 PINHOLE = (20.0, 20.0, 8.0, 6.0)
-DISAGREE = r"sparse/0 holds the model twice, and its binary and its text files disagree. Remove .* older"
 FAR_POINT = r"sparse/0: 1 of (1|60) sparse points are NaN or beyond 1e\+09, and are left out"
 COLMAP = {
     "no model": (lambda root: (root / "sparse").rename(root / ".sparse"), r"holds no COLMAP model: .* sparse, "),
-    "half a model": (lambda root: (root / IMAGES).unlink(), r"holds cameras.bin but no images.bin: it is not whole"),
+    "half a model": (
+        lambda root: (root / IMAGES).unlink(),
+        r"images.bin cannot be read \(FileNotFoundError",
+    ),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
@@ -264,9 +262,6 @@ COLMAP = {
     ),
     "a point with NaN": (point(np.nan), FAR_POINT),
     "a point beyond float32": (point(1e300), FAR_POINT),
-    "a twin of other poses": (twin(c2w=ring(9, height=2.0)), DISAGREE),
-    "a twin of other cameras": (twin(focal=(21.0, 20.0)), DISAGREE),
-    "a twin of other photographs": (twin(names=tuple(f"q_{view}.png" for view in range(9))), DISAGREE),
     "no rotation": (text(IMAGES, lambda old: old[:12] + bytes(32) + old[44:]), r"p_0.png has a pose or intrinsics"),
     "fx of zero": (cameras(1, 0.0, 20.0, 8.0, 6.0), r"sparse/0: the view p_0.png has the focal length 0, 20"),
     "another size": (cameras(1, 20.0, 20.0, 800.0, 600.0), r"principal point at 800, 600, outside of its 16 x 12"),
