@@ -168,8 +168,8 @@ def test_a_part_of_ones_own_that_is_not_found_says_where_python_looks(nerf, capt
 
 
 BROKEN = {
-    "colmap": ("sparse/0/images.bin", ("images.bin ends after 100 bytes", "cut short", "nerf poses images=DIR")),
-    "llff": ("poses_bounds.npy", ("poses_bounds.npy is not an array of numbers", "imgs2poses", "scene=colmap")),
+    "colmap": ("sparse/0/images.bin", ("images.bin cannot be read", "has 100 bytes", "nerf poses images=DIR")),
+    "llff": ("poses_bounds.npy", ("poses_bounds.npy cannot be read", "imgs2poses", "scene=colmap")),
     "transforms": ("transforms.json", ("transforms.json is not valid json", "line 1", "Export it again")),
 }
 WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}

@@ -318,7 +318,7 @@ def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
 
 
 IMPOSSIBLE = [
-    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.occupancy.OccupancySampler", "num_cascades": 60}},
+    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.occupancy.OccupancySampler", "num_steps": 0}},
     {"field": {"width": 1}},
 ]
 

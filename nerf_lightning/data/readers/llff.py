@@ -20,6 +20,7 @@ from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 
@@ -128,12 +129,9 @@ def _rows(path: Path) -> Float[ndarray, "views 17"]:
             f"{path} does not exist; the folder holds {contents(path.parent)}. "
             "Point scene.root at the folder that has it."
         )
-    try:
-        # Read by its own format: np.load would open archives too, and unpickle what is neither.
-        with open_regular(path, MOST_BYTES, CURE) as file:
-            rows = np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError) as error:
-        raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
+    # Read by its own format: np.load would open archives too, and unpickle what is neither.
+    with reading(path, CURE), open_regular(path, MOST_BYTES, CURE) as file:
+        rows = np.lib.format.read_array(file, allow_pickle=False)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":
         shape = " x ".join(map(str, rows.shape)) or "a single number"
         raise InputError(

@@ -162,7 +162,7 @@ def test_pickles_in_arrays(tmp_path):
     mark = tmp_path / "ran"
     evil = np.array([Payload(open, str(mark), "w")], dtype=object)
     for key in ("images", "poses", "focal"):
-        with pytest.raises(InputError, match=r"not a numpy .npz archive, or is damaged: Object arrays cannot be"):
+        with pytest.raises(InputError, match=r"npz cannot be read \(ValueError: Object arrays cannot be"):
             NpzReader(str(write_npz(tmp_path / "a.npz", **{key: evil}))).read()
     root = WRITERS["llff"](tmp_path / "capture")
     np.save(root / "poses_bounds.npy", evil, allow_pickle=True)
@@ -231,18 +231,18 @@ def bombs(tmp_path):
         root = WRITERS["colmap"](tmp_path / name)
         path = root / MODEL / f"{name}.bin"
         path.write_bytes(struct.pack("<Q", most) + path.read_bytes()[8:])
-        yield "colmap", root, "in the middle of what it announces"
+        yield "colmap", root, "it announces .* Copy the model again"
     root = WRITERS["colmap"](tmp_path / "sparse")
     with (root / MODEL / "points3D.bin").open("r+b") as file:
         file.truncate(50_000_000_000)
-    yield "colmap", root, "goes on for"
+    yield "colmap", root, "it announces .* bytes, and has 50,000"
     root = WRITERS["text"](tmp_path / "line")
     with (root / MODEL / "images.txt").open("r+b") as file:
         file.truncate(20_000_000_000)
     yield "colmap", root, "has more than 16,777,216 characters"
     root = WRITERS["text"](tmp_path / "lines")
     (root / MODEL / "points3D.txt").write_bytes(b"\n" * 4 * MEGABYTE + b"1 x\n")
-    yield "colmap", root, "should hold 3 numbers"
+    yield "colmap", root, "line 4194305 cannot be read"
     for name, text, words in (
         ("deep", "[" * 10**6, "nests its brackets too deeply"),
         ("nested", '{"frames": ' + "[" * 500 + "]" * 500 + "}", "frames"),
