@@ -214,10 +214,10 @@ def bombs(tmp_path):
     zip_bomb(tmp_path / "large.npz", npy((100, 1024, 1024, 1), "|u1"), 100 * MEGABYTE)
     zip_bomb(tmp_path / "lying.npz", npy((10**6, 800, 800, 3)), 10 * MEGABYTE)
     yield "npz", tmp_path / "large.npz", "unpacks to 0.10 GB"
-    yield "npz", tmp_path / "lying.npz", "is damaged"
+    yield "npz", tmp_path / "lying.npz", "cannot be read"
     root = WRITERS["llff"](tmp_path / "llff")
     (root / "poses_bounds.npy").write_bytes(npy((10**10, 17)) + bytes(136))
-    yield "llff", root, "is not an array of numbers as numpy saves it"
+    yield "llff", root, "cannot be read"
     for side in (60_000, 2**31 - 1):
         root = WRITERS["colmap"](tmp_path / f"png{side}")
         (root / "images" / "p_3.png").write_bytes(png(side, side))
