@@ -152,7 +152,7 @@ def _run(command: str, arguments: list[str]) -> None:
         from nerf_lightning.cli.loading import compose_once
         from nerf_lightning.config.search_path import search_extensions
 
-        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
+        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments], command)
         require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)
         arguments = quoted_paths(arguments, is_sweep(arguments))

@@ -11,6 +11,8 @@ from nerf_lightning.files.folders import conf_file, option_names
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""
+REQUIRED = "(required)"
+"""Stands for the value of a setting that has none until somebody gives it."""
 TAKES = {"bool": "bool", "int": "int", "float": "float", "seq": "list"}
 
 
@@ -162,7 +164,7 @@ def _settings(entries: dict[str, Entry], source: str, is_own: Callable[[str], bo
         takes = argument.takes if argument else TAKES.get(entry.type, "")
         meaning = " ".join(sentence(text, takes) for text in texts if text)
         if not name.startswith("_"):
-            found[key] = Setting(key, entry.text, takes, meaning, source, is_own(key))
+            found[key] = Setting(key, entry.text.replace("???", REQUIRED), takes, meaning, source, is_own(key))
     return list(found.values())
 
 
