@@ -37,8 +37,8 @@ class Option(NamedTuple):
 
     typed: str
     """How it is chosen, such as `scene=colmap`."""
-    about: list[str]
-    """The comment at the top of its yaml, and the docstring of what it builds."""
+    about: str
+    """The comment at the top of its yaml; without one, the docstring of what it builds."""
     is_global: bool
     settings: list[Setting]
     """Its own, those of the options that it is based on, and of those that it chooses for its parts."""
@@ -124,7 +124,7 @@ def read_option(group: str, name: str) -> Option:
     entries, chosen = _merged(file, folder, "" if file.is_global else f"{section}.")
     settings = _settings(entries, typed, lambda key: root(key) == root(section))
     maker = _maker(entries, section)
-    about = [text for text in (file.header, maker and maker.summary) if text]
+    about = file.header or (maker.summary if maker else "")
     parts = (read_option(part, name) for part, name in chosen.items() if "@" in part)
     return Option(typed, about, file.is_global, settings + [each for part in parts for each in part.settings], chosen)
 

@@ -46,7 +46,7 @@ def test_every_key_of_the_composed_config_is_known_with_its_default(command):
 @pytest.mark.parametrize("group", groups())
 def test_every_option_has_a_line_of_its_own(group):
     named = [each for command in COMMANDS.values() for each in command.options.items() if each[0] == group]
-    lines = [brief(option.about[0]) for _, options in named[:1] for option in options]
+    lines = [brief(option.about) for _, options in named[:1] for option in options]
     assert len(lines) == len(set(lines)), lines
     assert all(len(line) > 8 for line in lines), lines
 
