@@ -11,12 +11,14 @@ from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 
 
-def test_help_lists_every_command_with_its_line(nerf):
+def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     result = nerf("--help")
     assert result.code == 0
     for name in ("train", "eval", "render", "bench", "selftest"):
         assert f"\n  {name}" in result.out
     assert nerf().out == result.out
+    assert [line for line in result.out.splitlines() if len(line) > 80] == []
     assert all(summary for summary in find_commands().values())
 
 
