@@ -43,6 +43,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert "Takes 'white' | 'black'." in result.out
     assert "what.resolution=256" in nerf("help", "what.resolution").out
     assert nerf("help", "export").out == nerf("export", "--help").out
+    assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
     assert "in the user's units; null: from the capture." in told
     assert "With scene=blender" in told

@@ -59,7 +59,9 @@ def brief(text: str) -> str:
 def _groups(command: Command, in_full: list[str], width: int) -> Iterator[str]:
     for group in sorted(command.groups, key=lambda group: group not in in_full):
         options = command.options[group]
-        default = f" (default {command.chosen[group].typed.partition('=')[2]})" if group in command.chosen else ""
+        chosen = command.chosen.get(group)
+        default = chosen.typed.partition("=")[2] if chosen else "the run's" if group == "scene" else ""
+        default = f" (default {default})" if default else ""
         if group in in_full:
             yield f"  {group}{default}"
             yield from (row(f"  {option.typed}", brief(option.about), width) for option in options)
