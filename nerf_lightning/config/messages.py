@@ -11,6 +11,7 @@ from traceback import extract_tb
 from hydra.errors import HydraException, InstantiationException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from nerf_lightning.config.lightning_arguments import OWNED
 from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.config.manual.suggestions import did_you_mean, near
 from nerf_lightning.config.overrides import PLAIN, to_type
@@ -159,8 +160,12 @@ def _no_option(group: str, name: str) -> str | None:
 def _no_setting(name: str, value: str | None, asked: Command) -> str:
     having = listed(dict.fromkeys(each.source for each in asked.settings if each.key == name), cap=4)
     if having:
-        return f"{name} is a setting of {having}, and something else is chosen. nerf help {name} tells of it."
+        instead = " scene=bricks is rendered, in the size scene.resolution=N." if name == "scene.downscale" else ""
+        return f"{name} is a setting of {having}, and something else is chosen.{instead} nerf help {name} tells of it."
     told = f"nerf {asked.name} has no setting {name}."
+    section, _, argument = name.partition(".")
+    if section == "trainer" and argument in OWNED:
+        return f"{told} What Lightning's Trainer calls {argument} is {OWNED[argument]} here."
     training = command_named("train")
     if training is not None and name in known_names(training):
         return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."

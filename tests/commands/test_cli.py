@@ -118,6 +118,9 @@ def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf)
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
     said(nerf("bench", "experiment=quickstart"), "nerf bench has no setting experiment. It belongs to training")
     said(nerf("train", "+experiment=quickstart"), "leave the + out. Type experiment=quickstart.")
+    said(nerf("train", "trainer.accumulate_grad_batches=2"), "accumulate_grad_batches is data.batch_rays")
+    said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")
+    said(nerf("train", "scene.downscale=2"), "scene=bricks is rendered, in the size scene.resolution=N")
     assert "+zzzz=VALUE adds one of your own" in nerf("render", "zzzz=1").err
     result = nerf("train", "scene=blender")
     assert result.code == 2
