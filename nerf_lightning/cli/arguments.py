@@ -42,7 +42,7 @@ def _refuse(message: str, arguments: Sequence[str], command: str) -> NoReturn:
         value = value or next((word for before, word in pairwise(arguments) if before == option), "VALUE")
         hint = " or ".join(f"{key}={value}" for key in keys[:3])
         raise InputError(f"{option}: settings are given without dashes, as key=value. Type {hint}.")
-    hint = did_you_mean(option, COMMON)
+    hint = did_you_mean(option, COMMON) or f" nerf help {name.replace('_', ' ')} looks for a setting." * bool(name)
     raise InputError(f"{message}.{hint} nerf COMMAND --hydra-help lists the options; settings are given as key=value.")
 
 
