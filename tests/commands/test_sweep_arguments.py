@@ -83,3 +83,9 @@ def test_a_typo_is_not_taken_for_a_missing_plugin(nerf):
     result = nerf("train", "-m", "hydra/launcher=joblibb", "seed=0,1")
     assert result.code == 2
     assert "not installed" not in result.err
+
+
+def test_slurm_without_srun_is_refused_before_a_folder_is_taken(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match=r"Slurm's srun, which is not found here.*hydra/launcher=parallel"):
+        sweep_arguments(["-m", "hydra/launcher=slurm", "seed=0,1"])

@@ -12,6 +12,7 @@ from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.overrides import quoted
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding, require_sound
 from nerf_lightning.messages.console import say
@@ -99,8 +100,12 @@ def assemble_job(
 
 
 def searchpath_override() -> list[str]:
-    """Return the override that names folders with yamls of a person's own, if there is one."""
-    return [each for each in HydraConfig.get().overrides.hydra if each.startswith("hydra.searchpath=")]
+    """Return the override that names folders with yamls of a person's own (`--config-dir`), if there are some."""
+    hydra = HydraConfig.get()
+    named = [source.path for source in hydra.runtime.config_sources if source.provider == "command-line"]
+    if named:
+        return [f"hydra.searchpath={quoted([*hydra.searchpath, *named])}"]
+    return [each for each in hydra.overrides.hydra if each.startswith("hydra.searchpath=")]
 
 
 def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) -> list[Callback]:
