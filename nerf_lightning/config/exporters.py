@@ -1,4 +1,4 @@
-"""What the exporters of conf/what/ and of extensions say of themselves before one is built: needs, and kernels to compile.
+"""What the exporters of our conf/what/ folders say of themselves before one is built: needs, and kernels to compile.
 
 As a program (`python -m nerf_lightning.config.exporters`): compile all CPU kernels ahead of their first use.
 """

@@ -84,12 +84,12 @@ class SplatsExport(Export):
         budget = self._budget(pinholes)
         with StageProgress({"surfaces": 10.0, "views": 5.0, "fitting": self.seconds, "measured": 5.0}) as report:
             gaussians = initial_gaussians(model, record, budget, self.sh_degree, tile_points, self.seed, report)
-            views = self._training_views(model, record, scene, pinholes, tile_points)
-            report("views", 1.0)
-            extent = float((pinholes.c2w[:, :, 3] - pinholes.c2w[:, :, 3].mean(dim=0)).norm(dim=-1).max())
-            fitting = Fitting(budget, self.seconds, record.background, max(extent, 1e-6), self.seed)
-            with torch.enable_grad():
-                gaussians = fit(gaussians, views, fitting, report)
+            if self.seconds:
+                views = self._training_views(model, record, scene, pinholes, tile_points)
+                report("views", 1.0)
+                fitting = Fitting(budget, self.seconds, record.background, extent(pinholes), self.seed)
+                with torch.enable_grad():
+                    gaussians = fit(gaussians, views, fitting, report)
             measured, panels = self._measured(gaussians, model, record, scene, pinholes, tile_points, report)
         save_splats(path, moved(gaussians, record.to_user.double()), to_gltf(record))
         whole: dict[str, Any] = {"splats": len(gaussians), "bytes": path.stat().st_size}
@@ -126,8 +126,6 @@ class SplatsExport(Export):
     def _training_views(
         self, model: Model, record: SceneRecord, scene: SceneRecord, pinholes: Cameras, tile_points: int
     ) -> list[View]:
-        if self.seconds == 0:
-            return []
         if isinstance(scene, Scene):
             trained = {record.view_names[view] for view in record.splits["train"]}
             return [photographed(scene, v, pinholes) for v in scene.splits["train"] if scene.view_names[v] in trained]
@@ -167,6 +165,12 @@ class SplatsExport(Export):
             measured["field_metrics"] = mean_over_images(of_field)
         assert panels is not None
         return measured, mosaic((name, to_bytes(each)) for name, each in panels)
+
+
+def extent(cameras: Cameras) -> float:
+    """Return how far the cameras are from their middle, at most (scene units)."""
+    eyes = cameras.c2w[:, :, 3]
+    return max(float((eyes - eyes.mean(dim=0)).norm(dim=-1).max()), 1e-6)
 
 
 def to_gltf(record: SceneRecord) -> Float[Tensor, "4 4"]:

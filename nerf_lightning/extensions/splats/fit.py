@@ -40,6 +40,7 @@ class Fitting:
     budget: int
     """At most so many splats."""
     seconds: float
+    """Above 0."""
     background: Background
     extent: float
     """How far the cameras are apart, about (scene units): what steps of the means are measured in."""
@@ -51,7 +52,7 @@ def fit(gaussians: Gaussians, views: Sequence[View], fitting: Fitting, report: R
     state, generator = _State(gaussians, fitting.extent), torch.Generator().manual_seed(fitting.seed)
     began, step, order = time.monotonic(), 0, [0]
     with torch_on_one_thread():
-        while (done := (time.monotonic() - began) / max(fitting.seconds, 1e-9)) < 1.0:
+        while (done := (time.monotonic() - began) / fitting.seconds) < 1.0:
             if step % len(views) == 0:
                 order = torch.randperm(len(views), generator=generator).tolist()
             state.learn(views[order[step % len(views)]], _background(fitting.background, generator), LAST_RATE**done)
