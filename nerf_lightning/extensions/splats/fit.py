@@ -24,8 +24,8 @@ from nerf_lightning.nerf.types.scene import DRAWN, Background
 
 BETAS, EPS = (0.9, 0.99), 1e-15
 LAST_RATE = 0.05  # Of the last step, as a share of the first.
-RATES = {"log_scales": 1e-2, "quaternions": 4e-3, "opacity_logits": 5e-2, "sh_dc": 1e-2, "sh_rest": 2e-3}
-MEANS_RATE = 3e-4  # In extents of the scene.
+RATES = {"log_scales": 2e-2, "quaternions": 8e-3, "opacity_logits": 1e-1, "sh_dc": 2e-2, "sh_rest": 4e-3}
+MEANS_RATE = 6e-4  # In extents of the scene.
 EVERY = 100  # Steps between two rounds of pruning and splitting,
 UNTIL = 0.7  # and the share of the time in which there are any.
 LEAST_OPACITY = 0.005  # What is less opaque goes.
@@ -84,7 +84,8 @@ class _State:
         on_screen = torch.zeros(len(self.gaussians), 2, requires_grad=True)
         picture = rasterize(self.gaussians, view.camera, background, on_screen)
         error = picture - view.over(background)
-        loss = (error if view.kept is None else error[view.kept]).abs().mean()
+        error = error if view.kept is None else error[view.kept]
+        loss = error.square().mean()
         loss.backward()  # type: ignore[no-untyped-call]
         assert on_screen.grad is not None
         self.error += on_screen.grad.norm(dim=-1)
@@ -97,7 +98,7 @@ class _State:
             step_size = rate * self.rates[name] / (1 - b1**self.step)
             adam_step(tensor.detach(), tensor.grad, *moments, step_size, root_scale, BETAS, EPS)
             tensor.grad = None
-        return float(loss)
+        return float(loss.detach())
 
     def refine(self, budget: int, generator: torch.Generator) -> None:
         """Prune what is transparent, and split what moves most on the screen, up to the budget."""

@@ -22,8 +22,8 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 VIEWS, LONGEST = 40, 200  # Training views that are rendered, and their longer side in pixels.
 LEAST_OPACITY = 0.5  # Pixels that stop less light see no surface.
-OPACITY = 0.8
-SPREAD = 0.6  # Standard deviation along the surface, in distances to the three nearest neighbours.
+OPACITY = 0.6
+SPREAD = 0.4  # Standard deviation along the surface, in distances to the three nearest neighbours.
 FLAT = 0.2  # And across it, as a share of that.
 NEIGHBOURS = 3
 
