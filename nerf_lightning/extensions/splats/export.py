@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
 from nerf_lightning.export.density_grid import Report
@@ -35,6 +34,7 @@ from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 ROOM = "nerf_lightning.extensions.splats"
 KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
 PER_PIXEL, MOST = 2, 150_000
+MOST_SHOWN = 3_000_000  # 500 MB as PLY.
 TAUGHT = 60  # Views that the field renders where there are no photographs.
 
 
@@ -65,8 +65,9 @@ class SplatsExport(Export):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        enough = self.num_splats == "auto" or self.num_splats >= 1
-        require_setting("num_splats", self.num_splats, enough, "give 1 or more, or auto.")
+        shown = self.num_splats == "auto" or 1 <= self.num_splats <= MOST_SHOWN
+        rule = f"give 1 to {MOST_SHOWN:,} splats, which is what viewers show, or auto."
+        require_setting("num_splats", self.num_splats, shown, rule)
         require_setting("seconds", self.seconds, self.seconds >= 0, "give seconds of fitting, 0 or more.")
         require_setting("sh_degree", self.sh_degree, 0 <= self.sh_degree <= 3, "give 0, 1, 2 or 3.")
         require_setting("longest", self.longest, self.longest >= 16, "give 16 pixels or more.")
@@ -116,12 +117,7 @@ class SplatsExport(Export):
 
     def _budget(self, pinholes: Cameras) -> int:
         pixels = int((pinholes.width * pinholes.height).double().mean())
-        budget = min(PER_PIXEL * pixels, MOST) if self.num_splats == "auto" else self.num_splats
-        # Numbers, gradients and two moments, each twice while they are split; the screen, and gradients in each tile.
-        each = 4 * (2 * 4 * (14 + 3 * ((self.sh_degree + 1) ** 2 - 1)) + 60)
-        named = f"what.num_splats={budget:,} makes splats of {each:,} bytes while they are fitted"
-        require_memory(named, budget, lambda count: each * count, lambda count: f"what.num_splats={count}")
-        return budget
+        return min(PER_PIXEL * pixels, MOST) if self.num_splats == "auto" else self.num_splats
 
     def _training_views(
         self, model: Model, record: SceneRecord, scene: SceneRecord, pinholes: Cameras, tile_points: int

@@ -86,7 +86,7 @@ class _State:
         error = picture - view.over(background)
         error = error if view.kept is None else error[view.kept]
         loss = error.square().mean()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         assert on_screen.grad is not None
         self.error += on_screen.grad.norm(dim=-1)
         self.step += 1
@@ -94,9 +94,9 @@ class _State:
         root_scale = (1 - b2**self.step) ** -0.5
         for name, tensor in self.gaussians.tensors().items():
             assert tensor.grad is not None
-            moments = (getattr(each, name) for each in (self.first, self.second))
+            first, second = getattr(self.first, name), getattr(self.second, name)
             step_size = rate * self.rates[name] / (1 - b1**self.step)
-            adam_step(tensor.detach(), tensor.grad, *moments, step_size, root_scale, BETAS, EPS)
+            adam_step(tensor.detach(), tensor.grad, first, second, step_size, root_scale, BETAS, EPS)
             tensor.grad = None
         return float(loss.detach())
 

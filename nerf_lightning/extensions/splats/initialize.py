@@ -56,7 +56,8 @@ def initial_gaussians(
         )
     generator = torch.Generator().manual_seed(seed)
     cloud = cloud[torch.randperm(len(cloud), generator=generator)[:num_splats]]
-    return _flat_gaussians(*cloud.split(3, dim=-1), sh_degree)
+    points, normals, rgb = cloud.split(3, dim=-1)
+    return _flat_gaussians(points, normals, rgb, sh_degree)
 
 
 def _flat_gaussians(

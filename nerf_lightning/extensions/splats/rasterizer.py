@@ -89,7 +89,8 @@ def _arrays(camera: Pinhole) -> tuple[ndarray, ndarray, ndarray]:
 
 def try_kernels() -> None:
     """Draw one splat, and go back."""
-    splat = [torch.tensor(each) for each in ([[0.0, 0.0, 2.0]], [[-2.0] * 3], [[1.0, 0, 0, 0]], [0.0], [[1.0] * 3])]
-    gaussians = Gaussians(*splat, torch.ones(1, 3, 3)).map(lambda each: each.requires_grad_())
+    mean, turn, one = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3)
+    gaussians = Gaussians(mean, -2 * one, turn, torch.zeros(1), one.clone(), torch.ones(1, 3, 3))
+    gaussians = gaussians.map(lambda each: each.requires_grad_())
     camera = Pinhole(torch.eye(3), torch.zeros(3), (8.0, 8.0), (4.0, 4.0), 8, 8, 0.1)
     rasterize(gaussians, camera, torch.zeros(3)).sum().backward()

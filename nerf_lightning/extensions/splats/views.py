@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from nerf_lightning.export.visibility import nearest_views
 from nerf_lightning.extensions.splats.gaussians import Pinhole
 from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.geometry.lenses import project_plane
@@ -17,12 +16,6 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import straight_colors
-
-NEIGHBOURS = 4
-
-
-def _drawn(below, count, generator):
-    return torch.randint(below, (count,), generator=generator).tolist()
 
 
 @dataclass(frozen=True)
@@ -87,27 +80,6 @@ def rendered(
     """Return what the field shows a pinhole."""
     rays_of = RayGenerator(pinholes, record.near, record.far, names_photographs=model.needs_photographs)
     return render_picture(model, rays_of, view, background, tile_points)
-
-
-def between(cameras: Cameras, views: Sequence[int], count: int, generator: torch.Generator) -> Cameras:
-    """Return cameras on the way from some views, each as often as others, to one of the nearest of the rest.
-
-    Centres are mixed, and so are axes, then made orthogonal again (the nearest rotation, by SVD).
-    """
-    near = min(NEIGHBOURS, len(views) - 1)
-    chosen = [views[k % len(views)] for k in torch.randperm(count, generator=generator).tolist()]
-    others = (
-        [
-            nearest_views(cameras, view, views, near)[k]
-            for view, k in zip(chosen, _drawn(near, count, generator), strict=True)
-        ]
-        if near
-        else chosen
-    )
-    share = torch.rand(count, 1, 1, generator=generator)
-    mixed = torch.lerp(cameras.c2w[chosen], cameras.c2w[others], share)
-    left, _, right = torch.linalg.svd(mixed[:, :, :3])
-    return replace(cameras[chosen], c2w=torch.cat([left @ right, mixed[:, :, 3:]], dim=-1))
 
 
 def taught(model: Model, record: SceneRecord, pinholes: Cameras, views: Sequence[int], tile_points: int) -> list[View]:
