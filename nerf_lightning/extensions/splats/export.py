@@ -124,9 +124,12 @@ class SplatsExport(Export):
     ) -> list[View]:
         if isinstance(scene, Scene):
             trained = {record.view_names[view] for view in record.splits["train"]}
-            return [photographed(scene, v, pinholes) for v in scene.splits["train"] if scene.view_names[v] in trained]
-        views = evenly_spaced_subset(scene.splits["train"], TAUGHT)
-        return taught(model, record, pinholes, views, tile_points)
+            known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
+            views = [photographed(scene, view, pinholes) for view in known]
+            views = [view for view in views if view.kept is None or bool(view.kept.any())]
+            if views:
+                return views
+        return taught(model, scene, pinholes, evenly_spaced_subset(scene.splits["train"], TAUGHT), tile_points)
 
     def _measured(
         self,
@@ -145,7 +148,7 @@ class SplatsExport(Export):
         background = torch.zeros(3) if behind is None else behind[0]
         of_splats, of_field, panels = [], [], None
         for number, view in enumerate(views):
-            field = rendered(model, record, pinholes, view, tile_points, record.background).rgb.clamp(0, 1)
+            field = rendered(model, scene, pinholes, view, tile_points, record.background).rgb.clamp(0, 1)
             splats = rasterize(gaussians, Pinhole.of(pinholes, view, float(scene.near[view])), background).clamp(0, 1)
             truth, kept = field, None
             if isinstance(scene, Scene):
