@@ -1,6 +1,7 @@
 """Export splats: begin on the field's surfaces, fit to the photographs, measure beside the field, write."""
 
 import json
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,9 @@ from nerf_lightning.export.mesh_files import y_up
 from nerf_lightning.extensions.splats.files import SplatFormat, moved, require_library, save_splats
 from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
-from nerf_lightning.extensions.splats.initialize import initial_gaussians
+from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
 from nerf_lightning.extensions.splats.rasterizer import rasterize
-from nerf_lightning.extensions.splats.views import View, photographed, rendered, taught, without_lens
+from nerf_lightning.extensions.splats.views import View, photographed, rendered, without_lens
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
@@ -33,9 +34,8 @@ from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 
 ROOM = "nerf_lightning.extensions.splats"
 KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
-PER_PIXEL, MOST = 2, 150_000
+PER_SIDE, MOST = 200, 150_000
 MOST_SHOWN = 3_000_000  # 500 MB as PLY.
-TAUGHT = 60  # Views that the field renders where there are no photographs.
 
 
 @dataclass
@@ -43,7 +43,7 @@ class SplatsExport(Export):
     """Write `splats.ply`, `.spz` or `.glb`, `splats.json` with what was measured, and `splats.png` to look at.
 
     Args:
-        num_splats: at most so many; auto: two for each pixel of a view, and no more than 150,000.
+        num_splats: at most so many; auto: 200 for each pixel of a view's side, at most 150,000.
         seconds: of fitting to the training photographs; without them, or where the model has a correction for each
             camera, to pictures of the field; 0: as they lie on the field's surfaces.
         sh_degree: of the spherical harmonics of colours, 0 to 3.
@@ -83,14 +83,15 @@ class SplatsExport(Export):
         scene = record if photographs is None else photographs
         pinholes = without_lens(scene.cameras, self.longest)
         budget = self._budget(pinholes)
-        with StageProgress({"surfaces": 10.0, "views": 5.0, "fitting": self.seconds, "measured": 5.0}) as report:
-            gaussians = initial_gaussians(model, record, budget, self.sh_degree, tile_points, self.seed, report)
+        with StageProgress({"surfaces": 15.0, "fitting": self.seconds, "measured": 5.0}) as report:
+            around = look_around(model, record, tile_points, self.seed, report)
+            first = max(1, budget // 2) if self.seconds else budget
+            gaussians = initial_gaussians(around, first, self.sh_degree, self.seed)
             if self.seconds:
-                views = self._training_views(model, record, scene, pinholes, tile_points)
-                report("views", 1.0)
+                views = [] if photographs is None else training_views(record, photographs, pinholes)
                 fitting = Fitting(budget, self.seconds, record.background, extent(pinholes), self.seed)
                 with torch.enable_grad():
-                    gaussians = fit(gaussians, views, fitting, report)
+                    gaussians = fit(gaussians, views, around.views(), fitting, report)
             measured, panels = self._measured(gaussians, model, record, scene, pinholes, tile_points, report)
         save_splats(path, moved(gaussians, record.to_user.double()), to_gltf(record))
         whole: dict[str, Any] = {"splats": len(gaussians), "bytes": path.stat().st_size}
@@ -117,19 +118,7 @@ class SplatsExport(Export):
 
     def _budget(self, pinholes: Cameras) -> int:
         pixels = int((pinholes.width * pinholes.height).double().mean())
-        return min(PER_PIXEL * pixels, MOST) if self.num_splats == "auto" else self.num_splats
-
-    def _training_views(
-        self, model: Model, record: SceneRecord, scene: SceneRecord, pinholes: Cameras, tile_points: int
-    ) -> list[View]:
-        if isinstance(scene, Scene):
-            trained = {record.view_names[view] for view in record.splits["train"]}
-            known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
-            views = [photographed(scene, view, pinholes) for view in known]
-            views = [view for view in views if view.kept is None or bool(view.kept.any())]
-            if views:
-                return views
-        return taught(model, scene, pinholes, evenly_spaced_subset(scene.splits["train"], TAUGHT), tile_points)
+        return min(PER_SIDE * math.isqrt(pixels), MOST) if self.num_splats == "auto" else self.num_splats
 
     def _measured(
         self,
@@ -164,6 +153,14 @@ class SplatsExport(Export):
             measured["field_metrics"] = mean_over_images(of_field)
         assert panels is not None
         return measured, mosaic((name, to_bytes(each)) for name, each in panels)
+
+
+def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras) -> list[View]:
+    """Return the photographs that the model learnt from, by its record, and of which anything counts."""
+    trained = {record.view_names[view] for view in record.splits["train"]}
+    known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
+    views = [photographed(scene, view, pinholes) for view in known]
+    return [view for view in views if view.kept is None or bool(view.kept.any())]
 
 
 def extent(cameras: Cameras) -> float:

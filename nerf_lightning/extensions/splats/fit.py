@@ -6,7 +6,7 @@ what is transparent gives its place to what the gradient on the screen says is t
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +26,7 @@ BETAS, EPS = (0.9, 0.99), 1e-15
 LAST_RATE = 0.05  # Of the last step, as a share of the first.
 RATES = {"log_scales": 2e-2, "quaternions": 8e-3, "opacity_logits": 1e-1, "sh_dc": 2e-2, "sh_rest": 4e-3}
 MEANS_RATE = 6e-4  # In extents of the scene.
+TAUGHT_EVERY = 3  # Steps.
 EVERY = 100  # Steps between two rounds of pruning and splitting,
 UNTIL = 0.7  # and the share of the time in which there are any.
 LEAST_OPACITY = 0.005  # What is less opaque goes.
@@ -47,20 +48,31 @@ class Fitting:
     seed: int = 0
 
 
-def fit(gaussians: Gaussians, views: Sequence[View], fitting: Fitting, report: Report) -> Gaussians:
-    """Return splats whose pictures are nearer to the views' after some seconds; one view a step, in random order."""
+def fit(
+    gaussians: Gaussians, photographs: Sequence[View], taught: Sequence[View], fitting: Fitting, report: Report
+) -> Gaussians:
+    """Return splats whose pictures are nearer to the views' after some seconds; one view a step, in random order.
+
+    One in `TAUGHT_EVERY` is the field's, which knows what no photograph shows; all, where there are no photographs.
+    """
     state, generator = _State(gaussians, fitting.extent), torch.Generator().manual_seed(fitting.seed)
-    began, step, order = time.monotonic(), 0, [0]
+    began, step = time.monotonic(), 0
+    photographed, shown = _in_random_order(photographs, generator), _in_random_order(taught, generator)
     with torch_on_one_thread():
         while (done := (time.monotonic() - began) / fitting.seconds) < 1.0:
-            if step % len(views) == 0:
-                order = torch.randperm(len(views), generator=generator).tolist()
-            state.learn(views[order[step % len(views)]], _background(fitting.background, generator), LAST_RATE**done)
+            view = next(shown if step % TAUGHT_EVERY == 0 or not photographs else photographed)
+            state.learn(view, _background(fitting.background, generator), LAST_RATE**done)
             step += 1
             if step % EVERY == 0 and done < UNTIL:
                 state.refine(fitting.budget, generator)
             report("fitting", done)
     return state.gaussians.map(lambda each: each.detach())
+
+
+def _in_random_order(views: Sequence[View], generator: torch.Generator) -> Iterator[View]:
+    while True:
+        for number in torch.randperm(len(views), generator=generator).tolist():
+            yield views[number]
 
 
 def _background(background: Background, generator: torch.Generator) -> Float[Tensor, "3"]:

@@ -1,6 +1,5 @@
 """The pictures that splats are fitted to and judged by: photographs, or what the field renders, through pinholes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -80,13 +79,3 @@ def rendered(
     """Return what the field shows a pinhole."""
     rays_of = RayGenerator(pinholes, record.near, record.far, names_photographs=model.needs_photographs)
     return render_picture(model, rays_of, view, background, tile_points)
-
-
-def taught(model: Model, record: SceneRecord, pinholes: Cameras, views: Sequence[int], tile_points: int) -> list[View]:
-    """Return what the field shows some pinholes, with its opacity for alpha."""
-    found = []
-    for view in views:
-        picture = rendered(model, record, pinholes, view, tile_points, "black")
-        rgba = straight_colors(picture.rgb.clamp(max=picture.opacity[..., None]), picture.opacity)
-        found.append(View(Pinhole.of(pinholes, view, float(record.near[view])), rgba))
-    return found

@@ -63,7 +63,7 @@ def test_splats_lie_on_the_surface_in_the_captures_frame_and_none_is_haze(tmp_pa
     read = gsply.plyread(path)
     radius = np.linalg.norm(read.means - [5.0, 6.0, 7.0], axis=1) / 100.0
     assert len(radius) == 600
-    assert np.abs(radius - 0.8).max() < 0.06
+    assert np.abs(radius - 0.8).max() < 0.1
     assert np.exp(read.scales).max() < 30.0
 
 
@@ -113,7 +113,7 @@ def test_panoramas_and_empty_fields_are_refused(tmp_path):
     around = ball_scene(lens_model="equirectangular")
     with pytest.raises(InputError, match="ball is made of panoramas"):
         exported(tmp_path, solid(ball()), around)
-    with pytest.raises(InputError, match=r"no surface to put splats on: .* opacities of at most 0\.\d+"):
+    with pytest.raises(InputError, match=r"no surface to put splats on: the field's opacity is at most 0\.\d+"):
         exported(tmp_path, solid(ball(), inside=0.01), ball_scene(num_views=8, size=24))
     assert not list(tmp_path.iterdir())
 
