@@ -1,0 +1,200 @@
+"""Splat files: PLY as 3DGS wrote it, SPZ 3 (Niantic), and glTF with KHR_gaussian_splatting (Khronos).
+
+Each is whole or not there. PLY and SPZ say nothing of up and units, and keep the capture's own; SPZ's axes are right,
+up, back where PLY's are right, down, front, so that programs turn y and z when they read it.
+"""
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.extensions.splats.gaussians import TURN, Gaussians, rotations
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.errors import require_extra
+from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
+from nerf_lightning.nerf.geometry.frames import points_to_user, unit_of
+
+SplatFormat = Literal["ply", "spz", "glb"]
+FINE = 0.05  # SPZ's places are whole numbers of steps, so large a share of the splats' median size or smaller.
+LARGEST_PLACE = 1 << 23  # And so many steps from the origin.
+
+
+def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
+    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colours."""
+    unit = unit_of(matrix)
+    rotation = matrix[:3, :3] / unit
+    axes = rotation @ rotations(gaussians.quaternions.double())
+    return Gaussians(
+        points_to_user(gaussians.means.double(), matrix),
+        gaussians.log_scales + math.log(unit),
+        quaternions(axes).float(),
+        gaussians.opacity_logits,
+        gaussians.sh_dc,
+        turned_harmonics(gaussians.sh_rest, rotation),
+    )
+
+
+def quaternions(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
+    """Return unit quaternions (w, x, y, z) of rotations, by the largest of four (Shepperd 1978).
+
+    >>> quaternions(torch.diag(torch.tensor([1.0, -1.0, -1.0]))).tolist()
+    [0.0, 1.0, 0.0, 0.0]
+    """
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrices.flatten(-2).unbind(dim=-1)
+    rows = [
+        [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
+        [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
+        [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
+        [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
+    ]
+    candidates = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)  # 4 q_i q, for each i
+    best = candidates.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    return normalize(torch.take_along_dim(candidates, best[..., None, None], dim=-2)[..., 0, :], dim=-1)
+
+
+def turned_harmonics(
+    sh_rest: Float[Tensor, "n coefficients 3"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n coefficients 3"]:
+    """Return the coefficients of the same colours in a turned frame.
+
+    The harmonics of a degree turn among themselves: Y(R^T d) = Y(d) M for every direction d. Here M is what least
+    squares finds for more directions than harmonics, which is exact.
+    """
+    count = sh_rest.shape[1]
+    if not count:
+        return sh_rest
+    directions = normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=-1)
+    encoder = SphericalHarmonicsEncoder(math.isqrt(count + 1))
+    new, old = encoder(directions)[:, 1:], encoder(directions @ rotation.double())[:, 1:]
+    matrix = torch.linalg.lstsq(new, old).solution
+    return torch.einsum("jk,nkc->njc", matrix, sh_rest.double()).to(sh_rest)
+
+
+def save_splats(path: Path, gaussians: Gaussians, to_gltf: Float[Tensor, "4 4"]) -> None:
+    """Write splats of the capture's frame in the format of the file's name.
+
+    Args:
+        path: .ply, .spz or .glb.
+        gaussians: in the capture's frame.
+        to_gltf: similarity that takes that to glTF's, where y is up and a unit is a metre; no other format has one.
+    """
+    writers = {".ply": ply_bytes, ".spz": None, ".glb": lambda splats: glb_bytes(moved(splats, to_gltf))}
+    write = writers[path.suffix]
+    with whole_file(path) as part:
+        if write is None:
+            write_spz(part, gaussians)
+        else:
+            part.write_bytes(write(gaussians))
+
+
+def ply_bytes(gaussians: Gaussians) -> bytes:
+    """Return the file of 3DGS: one row of floats for each splat, all of them before any activation."""
+    rest = gaussians.sh_rest.shape[1]
+    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{c}" for c in range(3)), *(f"f_rest_{k}" for k in range(3 * rest))]
+    names += ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    columns = [
+        *(gaussians.means, torch.zeros(len(gaussians), 3), gaussians.sh_dc),
+        gaussians.sh_rest.mT.flatten(1),  # all of red, then green, then blue
+        *(gaussians.opacity_logits[:, None], gaussians.log_scales, normalize(gaussians.quaternions, dim=-1)),
+    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header += [*(f"property float {name}" for name in names), "end_header\n"]
+    return "\n".join(header).encode() + _floats(torch.cat([each.double() for each in columns], dim=1)).tobytes()
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> None:
+    """Write SPZ 3 by gsply, which writes numbers as they are: y and z are turned here, as the format wants them."""
+    gsply = require_library()
+    half_turn = torch.eye(4, dtype=torch.float64)
+    half_turn[:3, :3] = torch.diag(TURN)
+    splats = moved(gaussians, half_turn)
+    size = splats.log_scales.amax(dim=1).exp().median()
+    farthest = float(splats.means.abs().max().clamp(min=1e-6))
+    bits = math.ceil(-math.log2(FINE * float(size)))
+    bits = max(1, min(bits, math.floor(math.log2((LARGEST_PLACE - 1) / farthest)), 23))
+    data = gsply.GSData(
+        means=_floats(splats.means),
+        scales=_floats(splats.log_scales),
+        quats=_floats(splats.quaternions),
+        opacities=_floats(splats.opacity_logits),
+        sh0=_floats(splats.sh_dc),
+        shN=_floats(_coarse(splats.sh_rest)),
+    )
+    require_library("gsply.spz").write_spz(path, data, version=3, fractional_bits=bits)
+
+
+def _coarse(sh_rest: Float[Tensor, "n coefficients 3"]) -> Float[Tensor, "n coefficients 3"]:
+    # 5 bits of degree 1 and 4 of the others, as the format's own program has it: gzip makes half of that.
+    steps = torch.tensor([16.0] * 3 + [8.0] * (sh_rest.shape[1] - 3))[: sh_rest.shape[1], None]
+    return (sh_rest * steps).round() / steps
+
+
+def glb_bytes(gaussians: Gaussians) -> bytes:
+    """Return binary glTF: a primitive of points whose attributes are the splats', after their activations."""
+    prefix, rest = "KHR_gaussian_splatting:", gaussians.sh_rest
+    attributes = {
+        "POSITION": gaussians.means,
+        "COLOR_0": torch.cat(
+            [(0.5 + DEGREE_1 * gaussians.sh_dc).clamp(0, 1), gaussians.opacity_logits.sigmoid()[:, None]], dim=1
+        ),
+        f"{prefix}ROTATION": normalize(gaussians.quaternions, dim=-1)[:, [1, 2, 3, 0]],
+        f"{prefix}SCALE": gaussians.log_scales.exp(),
+        f"{prefix}OPACITY": gaussians.opacity_logits.sigmoid(),
+        f"{prefix}SH_DEGREE_0_COEF_0": gaussians.sh_dc,
+    }
+    for degree in range(1, gaussians.sh_degree + 1):
+        for k in range(2 * degree + 1):
+            attributes[f"{prefix}SH_DEGREE_{degree}_COEF_{k}"] = rest[:, degree * degree - 1 + k]
+    arrays = [_floats(each) for each in attributes.values()]
+    sizes = [array.nbytes for array in arrays]
+    starts = np.cumsum([0, *sizes]).tolist()
+    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": k, "componentType": 5126, "count": len(a), "type": kinds[1 if a.ndim == 1 else a.shape[1]]}
+        for k, a in enumerate(arrays)
+    ]
+    accessors[0] |= {"min": arrays[0].min(axis=0).tolist(), "max": arrays[0].max(axis=0).tolist()}
+    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splatting |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: k for k, name in enumerate(attributes)},
+        "extensions": {"KHR_gaussian_splatting": splatting},
+    }
+    tree = {
+        "asset": {"version": "2.0", "generator": "nerf-lightning"},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": at, "byteLength": size} for at, size in zip(starts, sizes, strict=False)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", starts[-1], b"BIN\0")
+    return (
+        struct.pack("<4sII", b"glTF", 2, 12 + len(chunks) + starts[-1]) + chunks + b"".join(a.tobytes() for a in arrays)
+    )
+
+
+def require_library(module: str = "gsply") -> Any:
+    """Return gsply, or say how it is installed."""
+    return require_extra(module, "splats", "Exporting splats as SPZ (what.format=spz)")
+
+
+def _floats(tensor: Tensor) -> Float[ndarray, "*n"]:
+    return np.ascontiguousarray(tensor.detach().numpy(), dtype="<f4")

@@ -1,0 +1,142 @@
+"""`nerf export what=splats`: fitted splats are nearer to the photographs, lie in the capture's frame, and refusals."""
+
+import json
+import sys
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+from support.known_fields import ball, photographed_ball, solid
+from support.planted import write_checkpoint
+from support.running import said
+from support.scenes import ball_scene
+
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.export.base import PageExtras
+from nerf_lightning.extensions.splats import export as exporter
+from nerf_lightning.extensions.splats.export import SplatsExport
+from nerf_lightning.extensions.splats.views import photographed, without_lens
+from nerf_lightning.messages import errors
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
+
+TILE = 1 << 15
+
+
+def exported(folder, model, scene, photographs=True, **settings):
+    export = SplatsExport(**({"num_splats": 600, "seconds": 0.0, "sh_degree": 1} | settings))
+    export.beside = PageExtras(photographs=scene if photographs else None)
+    with torch.no_grad():
+        written = export.export(model, scene_record(scene), folder, TILE)
+    return json.loads((folder / "splats.json").read_text()), written
+
+
+def test_fitting_brings_the_splats_nearer_to_the_photographs(tmp_path):
+    scene, model = photographed_ball(32)
+    lost = []
+    for seconds in (0.0, 1.5):
+        facts, written = exported(tmp_path / str(seconds), model, scene, seconds=seconds)
+        assert [path.name for path in written] == ["splats.ply", "splats.json", "splats.png"]
+        assert facts["splats"] <= 600
+        assert facts["fitted_to"] == "photographs"
+        lost.append(facts["field_metrics"]["psnr"] - facts["splats_metrics"]["psnr"])
+    assert lost[1] < lost[0] - 5.0
+
+
+def test_without_photographs_the_field_is_what_they_are_fitted_to(tmp_path):
+    scene, model = photographed_ball(24)
+    begun, fitted = (
+        exported(tmp_path / str(seconds), model, scene, photographs=False, seconds=seconds)[0] for seconds in (0.0, 1.0)
+    )
+    assert fitted["fitted_to"] == "the field"
+    assert "field_metrics" not in fitted
+    assert fitted["splats_metrics"]["psnr"] > begun["splats_metrics"]["psnr"] + 3.0
+
+
+def test_splats_lie_on_the_surface_in_the_captures_frame_and_none_is_haze(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed (the extra splats)")
+    to_user = similarity(upright_rotation(torch.tensor([1.0, 0.0, 0.0])), torch.tensor([5.0, 6.0, 7.0]), 100.0)
+    scene = replace(ball_scene(num_views=12, size=24, background="random"), to_user=to_user)
+    _, (path, *_) = exported(tmp_path, solid(ball()), scene, photographs=False)
+    read = gsply.plyread(path)
+    radius = np.linalg.norm(read.means - [5.0, 6.0, 7.0], axis=1) / 100.0
+    assert len(radius) == 600
+    assert np.abs(radius - 0.8).max() < 0.1
+    assert np.exp(read.scales).max() < 30.0
+
+
+def test_a_photograph_through_a_lens_is_what_a_pinhole_sees():
+    """The same soft ball, photographed with and without a lens."""
+    bent, _ = photographed_ball(48, lens=(0.2, 0.0, 0.0, 0.0, 0.0, 0.0), lens_model="radial_tangential")
+    straight, _ = photographed_ball(48)
+    for view in (0, 3):
+        seen = photographed(bent, view, without_lens(bent.cameras, 800))
+        expected = photographed(straight, view, without_lens(straight.cameras, 800))
+        error = (seen.over(torch.zeros(3)) - expected.over(torch.zeros(3))).abs()[seen.kept]
+        assert float(error.mean()) < 0.01
+        assert 0.5 < float(seen.kept.float().mean()) < 1.0 or bool(seen.kept.all())
+
+
+def test_larger_photographs_are_shrunk_with_their_cameras():
+    scene, _ = photographed_ball(48)
+    half = without_lens(scene.cameras, 24)
+    view = photographed(scene, 0, half)
+    assert view.rgba.shape == (24, 24, 4)
+    assert view.camera.focal == pytest.approx((1.6 * 24, 1.6 * 24))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"num_splats": 0}, "what.num_splats=0: give 1 to 3,000,000 splats, which is what viewers show, or auto"),
+        ({"num_splats": 10**9}, "what.num_splats=1000000000: give 1 to 3,000,000"),
+        ({"seconds": -1.0}, "what.seconds=-1.0: give seconds of fitting"),
+        ({"sh_degree": 4}, "what.sh_degree=4: give 0, 1, 2 or 3"),
+        ({"longest": 2}, "what.longest=2: give 16 pixels"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, said):
+    with pytest.raises(InputError) as error:
+        SplatsExport(**settings)
+    assert said in str(error.value)
+
+
+def test_normalised_device_coordinates_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"what=splats: ball was trained in normalised device coordinates"):
+        exported(tmp_path, solid(ball()), replace(ball_scene(), space="ndc"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_panoramas_and_empty_fields_are_refused(tmp_path):
+    around = ball_scene(lens_model="equirectangular")
+    with pytest.raises(InputError, match="ball is made of panoramas"):
+        exported(tmp_path, solid(ball()), around)
+    with pytest.raises(InputError, match=r"no surface to put splats on: the field's opacity is at most 0\.\d+"):
+        exported(tmp_path, solid(ball(), inside=0.01), ball_scene(num_views=8, size=24))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch):
+    def absent(name):
+        if name.startswith("gsply"):
+            raise ImportError("No module named 'gsply'")
+        return import_module(name)
+
+    monkeypatch.setattr(errors, "import_module", absent)
+    monkeypatch.setitem(sys.modules, "gsply", None)
+    with pytest.raises(InputError, match=r"SPZ .* needs gsply, .*pip install 'nerf-lightning\[splats\]'"):
+        exported(tmp_path, solid(ball()), ball_scene(num_views=8, size=24), format="spz")
+    monkeypatch.setattr(exporter, "backend", lambda module: None)
+    with pytest.raises(InputError, match="what=splats needs numba"):
+        exported(tmp_path, solid(ball()), ball_scene(num_views=8, size=24))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_finds_the_exporter_and_says_what_was_written(nerf, tmp_path):
+    tiny = write_checkpoint(tmp_path / "tiny.ckpt")
+    out = f"paths.output_dir={tmp_path}/out"
+    result = nerf("export", f"ckpt={tiny}", "what=splats", "what.num_splats=0", out)
+    said(result, "what.num_splats=0: give 1 to 3,000,000")
+    assert not (tmp_path / "out").exists()
