@@ -56,7 +56,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
         ("blurry", "Blurred, though it trained long enough"),
         ("grey", "The picture is grey"),
         ("gpu", "\n  trainer=gpu  "),
-        ("learning rate", "\n  optimizer.lr  "),
+        ("learning rate", "  optimizer.lr  "),
         ("batch size", "  data.batch_rays  "),
         ("out of memory", "prints the memory plan before training"),
     ],
