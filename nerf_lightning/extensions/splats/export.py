@@ -185,7 +185,8 @@ def _lines(known: dict[str, Any]) -> list[str]:
         psnr += ", the field's pictures taken for the truth"
     else:
         ssim = "" if field["ssim"] is None else f"; SSIM {splats['ssim']:.3f} and {field['ssim']:.3f}"
-        psnr += f", the field {field['psnr']:.2f} dB: {field['psnr'] - splats['psnr']:.2f} dB lost{ssim}"
+        gain = splats["psnr"] - field["psnr"]
+        psnr += f", the field {field['psnr']:.2f} dB: {abs(gain):.2f} dB {'gained' if gain >= 0 else 'lost'}{ssim}"
     size = f"{known['splats']:,} in {known['bytes'] / 1e6:.1f} MB, fitted to {known['fitted_to']}"
     return [
         f"splats       {size} for {known['fitting_seconds']:g} s ({known['seconds']:.0f} s in all)",
