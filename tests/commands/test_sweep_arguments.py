@@ -64,11 +64,9 @@ def test_a_requeued_slurm_job_finds_its_own_sweep(tmp_path, monkeypatch):
 )
 def test_a_plugin_that_is_not_installed_is_named_with_its_extra(tmp_path, group, plugin, extra):
     arguments = ["nerf", "train", "-m", f"hydra/{group}", "seed=0,1", f"paths.output_dir={tmp_path}/out"]
-    (tmp_path / "srun").touch(mode=0o755)  # without it, launcher=slurm is refused before
-    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
-    code = f"import os; os.environ['PATH'] = {path!r}; "
-    code += f"import sys; sys.modules['hydra_plugins'] = None; sys.argv = {arguments}; import nerf_lightning.__main__"
-    process = start_code(code)
+    code = f"import sys; sys.modules['hydra_plugins'] = None; sys.argv = {arguments}; import nerf_lightning.__main__"
+    (tmp_path / "srun").touch(mode=0o700)
+    process = start_code(code, env={"PATH": f"{tmp_path}:{os.environ['PATH']}"})
     _, told = process.communicate(timeout=300)
     assert process.returncode == 2, told
     kind = group.partition("=")[0]

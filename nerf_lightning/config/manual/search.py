@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from textwrap import fill
+from textwrap import TextWrapper
 
 from nerf_lightning.config.manual.catalogue import Command
 from nerf_lightning.config.manual.pages import brief, row
@@ -27,11 +27,10 @@ def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str
 
 def _symptoms(begun: list[re.Pattern[str]], width: int) -> Iterator[str]:
     """Yield what the page of symptoms says below its headings, as far as it fits."""
-    page = conf_folder().parent / "docs" / "troubleshooting.md"
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""  # an installed package has no docs
-    for section in text.split("\n## ")[1:]:
+    page = (conf_folder().parent / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    bullets = TextWrapper(width, initial_indent="  * ", subsequent_indent="    ")
+    for section in page.split("\n## ")[1:]:
         heading, *points = (" ".join(part.split()) for part in section.split("\n* "))
         fitting = [point for point in points if all(word.search(f"{heading} {point}") for word in begun)]
         if fitting:
-            lines = [fill(point, width, initial_indent="  * ", subsequent_indent="    ") for point in fitting]
-            yield "\n".join([heading, *lines, ""])
+            yield "\n".join([heading, *map(bullets.fill, fitting), ""])
