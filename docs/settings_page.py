@@ -35,7 +35,7 @@ def _of_group(command: Command, group: str) -> Iterator[str]:
         if default is not None:
             yield from (f"`{default.typed}` where nothing is said.", "")
         yield from ("| option | what it is |", "|---|---|")
-        yield from (f"| `{option.typed}` | {_cell(brief(option.about[0]))} |" for option in options)
+        yield from (f"| `{option.typed}` | {_cell(brief(option.about))} |" for option in options)
         yield ""
     yield from _table(each for option in options for each in option.settings)
 

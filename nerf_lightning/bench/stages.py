@@ -1,4 +1,4 @@
-"""`nerf bench`: where the time of a step goes: its stages, waiting for the batch, arithmetic, seconds to a PSNR."""
+"""`nerf bench`: where the time of a step goes: its stages, waiting for the batch, arithmetic."""
 
 from collections.abc import Callable
 
@@ -6,17 +6,13 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from nerf_lightning.compute.machine import seconds_of, torch_threads
-from nerf_lightning.data.ray_batches import FixedRays, RayBatches
-from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
-
-LOOK_EVERY = 25
-VALIDATION_RAYS = 8192
 
 
 def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
@@ -38,27 +34,6 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
         walking, screening = seconds_of(lambda: sampler(rays, None)), seconds_of(lambda: level.field.density(points))
     rest = whole - walking - screening
     return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
-
-
-def seconds_to_psnr(
-    take_step: Callable[[], None], training: TrainStep, batches: RayBatches, target: float, most_steps: int
-) -> tuple[float, int] | None:
-    """Train until the validation rays reach a PSNR; return training seconds and steps, or None where they never do."""
-    rays = FixedRays(batches.scene, "val", VALIDATION_RAYS, VALIDATION_RAYS)
-    used = 0.0
-    for step in range(1, most_steps + 1):
-        used += seconds_of(take_step)
-        if step % LOOK_EVERY == 0 and _psnr(training, rays) >= target:
-            return used, step
-    return None
-
-
-@torch.no_grad()
-def _psnr(training: TrainStep, rays: FixedRays) -> float:
-    errors = RayErrors()
-    for batch in rays:
-        training.validate(batch.to(training.device), errors)
-    return errors.summary()["val/psnr"]
 
 
 class LoadedSteps:

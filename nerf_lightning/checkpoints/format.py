@@ -14,7 +14,7 @@ from nerf_lightning.files.trust import Mismatch, require_fit
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
-FORMAT = 6
+FORMAT = 7
 KEY = "nerf_lightning"
 PARTS = ("model.", "rays.", "correction.", "loss.")
 """Of a training step: what their weights' names begin with."""
@@ -25,7 +25,7 @@ Precision = Literal["32-true", "tf32", "bf16-mixed"]
 PRECISIONS = get_args(Precision)
 
 RECORD: dict[str, Any] = {
-    "format": Literal[6],
+    "format": Literal[7],
     "version": str,
     "config": str,
     "choices": dict[str, str],

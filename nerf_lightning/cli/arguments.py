@@ -1,16 +1,18 @@
 """The words of a command line: Hydra's own options, by Hydra's own parser, settings, and paths made overrides."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
+from nerf_lightning.config.manual.catalogue import command_named, known_names
 from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve", "--config-dir", "--hydra-help")
 
 
-def options_first(arguments: Sequence[str]) -> list[str]:
+def options_first(arguments: Sequence[str], command: str = "train") -> list[str]:
     """Return Hydra's options, each as one word, and after them the overrides, wherever they were typed.
 
     Raises:
@@ -22,7 +24,7 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     from hydra._internal.utils import get_args_parser  # imported late: `--help` needs no Hydra
 
     parser = get_args_parser()
-    parser.error = _refuse  # type: ignore[method-assign]
+    parser.error = lambda message: _refuse(message, arguments, command)  # type: ignore[method-assign]
     unasked = vars(parser.parse_args([]))
     asked = vars(parser.parse_intermixed_args(arguments))
     overrides: list[str] = asked.pop("overrides")
@@ -30,9 +32,17 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     return [*(name if value is True else f"{name}={value}" for name, value in given.items()), *overrides]
 
 
-def _refuse(message: str) -> NoReturn:
+def _refuse(message: str, arguments: Sequence[str], command: str) -> NoReturn:
     option = next((word for word in message.split() if word.startswith("--")), "")
-    hint = did_you_mean(option, COMMON)
+    name, _, value = option.removeprefix("--").replace("-", "_").partition("=")
+    asked = command_named(command)
+    known = [key for key in known_names(asked) if not key.startswith("hydra")] if asked and name else []
+    keys = [key for key in known if key.rpartition(".")[2] == name]
+    if keys:
+        value = value or next((word for before, word in pairwise(arguments) if before == option), "VALUE")
+        hint = " or ".join(f"{key}={value}" for key in keys[:3])
+        raise InputError(f"{option}: settings are given without dashes, as key=value. Type {hint}.")
+    hint = did_you_mean(option, COMMON) or f" nerf help {name.replace('_', ' ')} looks for a setting." * bool(name)
     raise InputError(f"{message}.{hint} nerf COMMAND --hydra-help lists the options; settings are given as key=value.")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from nerf_lightning.config.manual.candidates import SHELLS, candidates
 from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.config.manual.pages import command_page, page_of
+from nerf_lightning.config.manual.search import search
 from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
@@ -32,9 +33,19 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
     """Return the help of what words name: a command, or parts and settings of the first command that has them."""
     if words[0] in commands:
         return help_on(words[0], words[1:])
-    # Most are of training; what only others have is found there.
+    pages = [_in_every_command(word, commands) for word in words]
     order = sorted(commands, key=lambda name: name != "train")
-    return "\n\n".join(_found(word, order) for word in words)
+    found = "" if all(pages) else search(words, list(map(_command, order)), _width())
+    return found or "\n\n".join(page or _found(word, order) for word, page in zip(words, pages, strict=True))
+
+
+def _in_every_command(word: str, commands: list[str]) -> str:
+    """Return what a word means in training; if it has no meaning there, in each other command."""
+    pages = {name: page_of(_command(name), word, _width()) for name in commands}
+    told = {page: name for name, page in pages.items() if page}
+    if len(told) < 2 or pages["train"]:
+        return pages["train"] or next(iter(told), "")
+    return "\n\n".join(f"nerf {name}: {page}" for page, name in told.items())
 
 
 def _found(word: str, names: list[str]) -> str:

@@ -6,10 +6,12 @@ Nothing heavy is imported here, so that `nerf --help` answers at once.
 import ast
 import importlib
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import fill
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -35,14 +37,15 @@ OF_ITSELF = {
 VERBOSE = ("-v", "--verbose")
 DETAILS = "hydra.verbose=[nerf_lightning]"
 """What they stand for: the details that our own modules log."""
-HELP = """nerf: learn a radiance field from photographs with known cameras, and render new views.
+HELP = """nerf: learn a radiance field from photographs, and render new views.
 
 usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
 
 {}
 
 nerf COMMAND --help lists the groups, the settings and examples of a command.
-nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene, nerf help scene=colmap.
+nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene.
+nerf help WORDS looks for words: nerf help blurry, nerf help learning rate.
 python -m nerf_lightning is the same."""
 USAGE_ERROR = 2
 MOST_LETTERS = 5000
@@ -113,7 +116,9 @@ def _summary(file: Path) -> str:
 
 def _help(commands: dict[str, str]) -> str:
     width = max(map(len, [*commands, *OF_ITSELF]))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in (commands | OF_ITSELF).items()]
+    columns, indent = min(shutil.get_terminal_size((120, 24)).columns, 120), " " * (width + 4)
+    rows = [f"  {name:<{width}}  {summary}" for name, summary in (commands | OF_ITSELF).items()]
+    lines = [fill(row, columns, subsequent_indent=indent) for row in rows]
     return HELP.format("\n".join(lines))
 
 
@@ -152,7 +157,7 @@ def _run(command: str, arguments: list[str]) -> None:
         from nerf_lightning.cli.loading import compose_once
         from nerf_lightning.config.search_path import search_extensions
 
-        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
+        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments], command)
         require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)
         arguments = quoted_paths(arguments, is_sweep(arguments))

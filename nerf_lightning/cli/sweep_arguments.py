@@ -1,5 +1,6 @@
 """The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
 
+import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +36,11 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
         if resuming:
             raise InputError("sweep.resume=true goes on with a sweep: add -m. A single run goes on with resume=auto.")
         return arguments
+    if _value(arguments, "hydra/launcher") == "slurm" and shutil.which("srun") is None:
+        raise InputError(
+            "hydra/launcher=slurm submits its jobs with Slurm's srun, which is not found here. Start the sweep where "
+            "srun is (a login node of the cluster), or run its jobs on this machine: hydra/launcher=parallel."
+        )
     from nerf_lightning.runs.sweep_record import JOB_NUMBER
 
     # Hydra reads -m only before the overrides.

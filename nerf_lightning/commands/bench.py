@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
-from nerf_lightning.bench.callbacks import watching_seconds
 from nerf_lightning.bench.kernels import compared_kernels
 from nerf_lightning.bench.prepared import Bench, prepare
 from nerf_lightning.bench.stages import (
@@ -26,7 +25,6 @@ from nerf_lightning.bench.stages import (
     LoadedSteps,
     flops_per_ray,
     multiplication,
-    seconds_to_psnr,
     stage_seconds,
 )
 from nerf_lightning.compute.cores import num_cores
@@ -34,10 +32,8 @@ from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_thread
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_console
-from nerf_lightning.training.callbacks.watcher import Watcher
+from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
 
-MOST_STEPS = 2000
 Work = Callable[[], Any]
 Rows = dict[str, Float[np.ndarray, "rounds"]]
 
@@ -45,7 +41,8 @@ Rows = dict[str, Float[np.ndarray, "rounds"]]
 def run(config: DictConfig) -> float:
     """Measure, print a table, write bench.json; return training rays per second."""
     bench = prepare(config, build(config.scene).read())
-    reached = _train_first(bench, config)
+    for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
+        bench.take_step()
     bench.train(config.steps)
     peak = peak_memory()  # before the whole batches of the plain kinds
     rows, flops = _rows_of_steps(bench, config)
@@ -56,7 +53,6 @@ def run(config: DictConfig) -> float:
         for name, values in rows.items()
     }
     result |= {
-        "seconds_and_steps_to_target_psnr": reached,
         "machine": bench.settings.describe(),
         "tile_points": bench.settings.tile_points,
         "batch_rays": bench.batch.num_rays,
@@ -69,16 +65,6 @@ def run(config: DictConfig) -> float:
     write_json(folder / "bench.json", result)
     say(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])
-
-
-def _train_first(bench: Bench, config: DictConfig) -> tuple[float, int] | None:
-    """Train until a PSNR is reached, and return seconds and steps; or for a number of steps."""
-    if config.target_psnr is not None:
-        most = config.warmup_steps or MOST_STEPS
-        return seconds_to_psnr(bench.take_step, bench.step, bench.batches, config.target_psnr, most)
-    for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
-        bench.take_step()
-    return None
 
 
 def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:
@@ -126,10 +112,6 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
     stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
     for name in stages[0]:
         rows[f"{name}, share of a step"] = np.array([each[name] for each in stages]) * steps / train
-    watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
-    watching = watching_seconds(watchers, bench.step, bench.optimizer, bench.data, bench.batch)
-    rows["watching, share of a step"] = sum(watching.values()) * steps / train
-    rows |= {f"watching: {name}, share of a step": value * steps / train for name, value in watching.items()}
     for count in threads:
         label = "training on 1 thread, milliseconds" if count == 1 else f"training on {count} threads, times one"
         one, more = seconds["train on 1"], seconds[f"train on {count}"]
@@ -164,8 +146,5 @@ def _print_table(result: dict[str, Any]) -> None:
     for name, value in result.items():
         if isinstance(value, dict):
             table.add_row(name, *(f"{value[key]:,.3g}" if value[key] < 100 else f"{value[key]:,.0f}" for key in value))
-    if result["seconds_and_steps_to_target_psnr"] is not None:
-        seconds, steps = result["seconds_and_steps_to_target_psnr"]
-        table.add_row("time to the target PSNR", spoken(seconds), f"{steps} steps", "")
     table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
     StdoutConsole(width=100).print(table)

@@ -72,7 +72,7 @@ def _rows(settings: TrainerSettings) -> list[Row]:
         try:
             checks = [
                 *kernels.checks(device, precisions),
-                *training.checks(device, precisions, settings.compile or settings.device_type == "cuda"),
+                *training.checks(device, precisions),
                 *command_line.checks(runs, device, chosen),
             ]
             return [carried_out(check) for check in track(checks, transient=True, console=stderr_console())]
@@ -90,7 +90,7 @@ def machine(device: torch.device) -> dict[str, Any]:
     """Return what a bug report should say of this machine, beside the versions of libraries."""
     known: dict[str, Any] = {
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
-        "cpu_flags": _cpu_flags(),
+        "cpu_flags": " ".join(sorted(set(FLAGS.findall(collect_env.get_cpu_info(collect_env.run))))) or "unknown",
         "threads": {"torch": torch.get_num_threads(), "of the machine": os.cpu_count()},
     }
     if device.type == "cuda":
@@ -106,12 +106,3 @@ def machine(device: torch.device) -> dict[str, Any]:
             },
         }
     return known
-
-
-def _cpu_flags() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "unknown"
-    line = re.search(r"^(?:flags|Features)\s*:(.*)$", text, re.MULTILINE)
-    return " ".join(sorted(set(FLAGS.findall(line[1])))) if line else "unknown"

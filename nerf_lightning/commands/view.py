@@ -1,5 +1,7 @@
 """Look around in a checkpoint, in the browser."""
 
+from threading import Thread
+
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import scene_record
@@ -8,7 +10,7 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.auth import names_of
-from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
+from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -23,8 +25,6 @@ def run(config: DictConfig) -> None:
     if opened.model.needs_photographs:
         scene = scene_to_look_at(opened, config.scene if config.photographs else None)
         record = scene_record(scene)
-    elif config.photographs:
-        scene = read_photographs(config, opened)
     background = known_background(config.background or record.background)
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "viewer"))
@@ -32,11 +32,12 @@ def run(config: DictConfig) -> None:
     renderer.warm_up()
     queue = RenderQueue(renderer)
     where = config.host, config.port, config.max_height, config.viewer.hosts
-    page = Page(queue, Photographs(record, scene, background), folder, *where)
+    photographs = Photographs(record, scene, background)
+    page = Page(queue, photographs, folder, *where)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C ends it)")
-    if config.open_browser:
-        open_in_browser(page.address)
+    if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with
+        Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:
         while not stopped:
             queue.work_or_wait()

@@ -27,7 +27,10 @@ SHORT_SECONDS = 100
 FEW_PHOTOGRAPHS = 30
 """To train on: fewer tell no finer grid what is true, unless known distances do."""
 TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
-"""log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
+"""log2 of a hash table's entries, by finest resolution.
+
+After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and 32.09 dB with 1024 and 2^18.
+"""
 
 log = logging.getLogger(__name__)
 

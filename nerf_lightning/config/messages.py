@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,7 @@ from traceback import extract_tb
 from hydra.errors import HydraException, InstantiationException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from nerf_lightning.config.lightning_arguments import OWNED
 from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.config.manual.suggestions import did_you_mean, near
 from nerf_lightning.config.overrides import PLAIN, to_type
@@ -21,6 +23,7 @@ ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
 KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")
+ADDED = re.compile(r"(?:use 'override|remove \+ prefix:) '?(\S+?)(?:: |=)(.*?)'")
 DELETED = re.compile(r"Could not delete(?: from config\.)? '(?P<key>[^']+)'(?P<value>)")
 OPTION = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 
@@ -91,8 +94,7 @@ def explain(error: BaseException, command: str) -> str:
         if isinstance(link, InputError):
             return str(link)
         if isinstance(link, MissingMandatoryValue):
-            key = getattr(link, "full_key", None) or str(link)
-            return f"{key} has no value. Give one on the command line: {key}=VALUE."
+            return _not_given(getattr(link, "full_key", None) or str(link), command)
     if isinstance(error, InstantiationException):
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
@@ -115,6 +117,16 @@ def explain(error: BaseException, command: str) -> str:
     return unknown_name(message, command) or f"{message} {ALL_OF.format(command)}"
 
 
+def _not_given(key: str, command: str) -> str:
+    if key not in ("ckpt", "run"):
+        return f"nerf {command} needs {key}: add {key}=VALUE. nerf help {key} tells what it is."
+    last = max(Path("outputs").glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
+    if last is None:
+        return f"nerf {command} needs a run, and outputs/ holds none: train one, or name its folder with {key}=DIR."
+    newest = shlex.quote(str(last.parent.parent))  # cli/quoting.py does the rest
+    return f"nerf {command} needs a run. For the newest below outputs/, type: nerf {command} {key}={newest}"
+
+
 def _chain(error: BaseException | None) -> list[BaseException]:
     links: list[BaseException] = []
     while error is not None and error not in links:  # one that is raised again may follow from itself
@@ -131,6 +143,9 @@ def unknown_name(message: str, command: str) -> str | None:
     option, key = OPTION.search(message), KEY.search(message) or DELETED.search(message)
     if option is not None:
         return _no_option(*option.groups())
+    added = ADDED.search(message)
+    if added is not None:
+        return f"nerf {command} has {added[1]} already: leave the + out. Type {added[1]}={added[2]}."
     return None if key is None else _no_setting(key["key"], key["value"], asked)
 
 
@@ -145,13 +160,17 @@ def _no_option(group: str, name: str) -> str | None:
 def _no_setting(name: str, value: str | None, asked: Command) -> str:
     having = listed(dict.fromkeys(each.source for each in asked.settings if each.key == name), cap=4)
     if having:
-        return f"{name} is a setting of {having}, and something else is chosen. nerf help {name} tells of it."
-    close = near(name, known_names(asked))
+        instead = " scene=bricks is rendered, in the size scene.resolution=N." if name == "scene.downscale" else ""
+        return f"{name} is a setting of {having}, and something else is chosen.{instead} nerf help {name} tells of it."
     told = f"nerf {asked.name} has no setting {name}."
-    if close:
-        given = f"={value}" if value and PLAIN.fullmatch(value) else ""
-        return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"
+    section, _, argument = name.partition(".")
+    if section == "trainer" and argument in OWNED:
+        return f"{told} What Lightning's Trainer calls {argument} is {OWNED[argument]} here."
     training = command_named("train")
     if training is not None and name in known_names(training):
         return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."
+    close = near(name, known_names(asked))
+    if close:
+        given = f"={value}" if value and PLAIN.fullmatch(value) else ""
+        return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"
     return f"{told} nerf {asked.name} --help lists what it has; +{name}=VALUE adds one of your own."

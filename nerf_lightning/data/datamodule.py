@@ -29,7 +29,7 @@ class RayDataModule(LightningDataModule):
         scene: what a reader returned.
         progress: the run's place, shared with the system.
         seed: the run's seed.
-        batch_rays: rays per training step; the most, with a budget.
+        batch_rays: rays per training step (the batch size); the most, with a budget.
         sample_budget: rays per step adapt, in a few fixed sizes, so that a step has about so many samples; None: they
             do not. Steps then stay equally long once empty space is skipped, and see more rays; larger budgets make
             them steadier and slower. It needs a model that skips empty space.

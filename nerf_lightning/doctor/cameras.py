@@ -101,15 +101,6 @@ def field_of_view(evidence: Given) -> Check:
     return ok(message)
 
 
-def panoramas(evidence: Given) -> Check:
-    """Look for panoramas of all directions that are read as perspective photographs."""
-    cameras = evidence.scene.cameras
-    if cameras.lens_model in ("equirectangular", "fisheye") or bool((cameras.width != 2 * cameras.height).any()):
-        return ok("the lens fits the shape of the photographs")
-    cure = "If so, give camera_model EQUIRECTANGULAR in transforms.json, without focal lengths. If not, all is well."
-    return look("all photographs are exactly 2:1: are these panoramas?", cure)
-
-
 def principal_point(evidence: Given) -> Check:
     """Judge how far the principal point lies from the photograph's centre; a halved one is named."""
     cameras = evidence.scene.cameras
@@ -231,7 +222,6 @@ CHECKS = {
     "common middle": common_middle,
     "upright": upright,
     "field of view": field_of_view,
-    "panoramas": panoramas,
     "principal point": principal_point,
     "lens": lens,
 }

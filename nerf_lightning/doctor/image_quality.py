@@ -1,4 +1,4 @@
-"""Checks of the photographs themselves, and of the memory that training on them takes."""
+"""Checks of the photographs themselves."""
 
 import math
 
@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.compute.machine import free_memory
-from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, model_for
 from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.doctor.features import THUMBNAIL
 from nerf_lightning.doctor.matches import Matches, nearest_views
@@ -28,10 +26,6 @@ EXPOSURE, TINT = 1.35, 1.2
 FEWEST = 20
 EVEN = 0.97
 COLOURS = {"white": 1.0, "black": 0.0}
-# Bytes that training takes beside the pixels, the program itself included: the most of a process on a CPU, measured.
-BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.0e9}
-MANY_PIXELS = 200e6
-SMALL = 64
 
 
 def duplicates(evidence: Evidence) -> Check:
@@ -191,28 +185,6 @@ def masks(evidence: Evidence) -> Check:
     return ok(message)
 
 
-def memory(evidence: Evidence) -> Check:
-    """Judge the memory that training takes, and the size of the photographs."""
-    pixels = evidence.scene.pixels
-    count = len(pixels.rgba)
-    store = pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
-    model, reason = model_for(evidence.scene)
-    needed, free = store + BESIDE_PIXELS[model], free_memory()
-    message = (
-        f"{count / 1e6:.1f} million pixels take {store / 1e9:.2f} GB; training with model={model} takes "
-        f"about {needed / 1e9:.1f} GB on a CPU, {free / 1e9:.1f} GB are free; model=auto chooses it, since {reason}"
-    )
-    sides = f"{int(pixels.width.max())} x {int(pixels.height.max())}"
-    if needed > free:
-        return look(message, "Set scene.downscale=2 (or 4): a quarter (a sixteenth) of the pixels.")
-    if count > MANY_PIXELS:
-        cure = "On a CPU begin with scene.downscale=2 or 4."
-        return look(f"{message}; photographs of {sides} need many steps", cure)
-    if int(pixels.width.min()) < SMALL or int(pixels.height.min()) < SMALL:
-        return look(f"{message}; photographs of {sides} show little", "Use larger photographs.")
-    return ok(message)
-
-
 def _jumps(factor: Tensor, limit: float) -> list[int]:
     off = torch.maximum(factor, 1 / factor)
     order = off.argsort(descending=True)
@@ -226,5 +198,4 @@ CHECKS = {
     "transparency": transparency,
     "background": baked_background,
     "masks": masks,
-    "memory": memory,
 }

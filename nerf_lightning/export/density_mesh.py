@@ -1,10 +1,9 @@
 """The surface where the density crosses a level, as a mesh: closed, the insides of things included.
 
-Marching cubes (Lewiner et al. 2003, by scikit-image) go block by block; what floats is removed.
+Marching cubes (Lewiner et al. 2003) are scikit-image's; what floats is removed.
 """
 
 import logging
-from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,8 +20,6 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 BYTES_PER_POINT = 8  # The density's grid, and as much again for the mesh.
 RATIO = 10.0  # So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
-
-BLOCK = 64  # Cells along a block's side.
 
 log = logging.getLogger(__name__)
 
@@ -69,48 +66,16 @@ def _level(
 
 
 def marching_cubes(
-    density: Float[ndarray, "x y z"], level: float, report: Report, block: int = BLOCK
+    density: Float[ndarray, "x y z"], level: float, report: Report
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside.
-
-    Blocks share the points between them and so the vertices there, bit for bit, which are then made one.
-    """
+    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside."""
     measure = require_library("skimage.measure")
-    corners = list(product(*(range(0, size - 1, block) for size in density.shape)))
-    vertices, faces, shared = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.int32)], [np.zeros(0, bool)]
-    count = 0
-    for number, corner in enumerate(corners):
-        part = density[tuple(slice(start, start + block + 1) for start in corner)]
-        if part.min() < level < part.max():
-            found, triangles, _, _ = measure.marching_cubes(part, level)
-            vertices.append(np.array(corner, np.float32) + found)
-            # scikit-image's run clockwise where what is dense lies inside.
-            faces.append(triangles[:, ::-1] + np.int32(count))
-            shared.append(((found == 0) | (found == np.array(part.shape) - 1)).any(axis=1))
-            count += len(found)
-        report("surface", (number + 1) / len(corners))
-    return _joined(*(_emptied(parts) for parts in (vertices, faces, shared)))
-
-
-def _joined(
-    vertices: Float[ndarray, "all 3"], faces: Int[ndarray, "faces 3"], shared: ndarray
-) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Make one of the vertices that several blocks have, and drop the triangles that have no area then."""
-    of_one, of_many = np.flatnonzero(~shared), np.flatnonzero(shared)
-    once, place = np.unique(vertices[of_many], axis=0, return_inverse=True)
-    number = np.empty(len(vertices), np.int32)
-    number[of_one] = np.arange(len(of_one))
-    number[of_many] = len(of_one) + place.reshape(-1)
-    faces = number[faces]
-    a, b, c = faces.T
-    return np.concatenate([vertices[of_one], once]), faces[(a != b) & (b != c) & (a != c)]
-
-
-def _emptied(parts: list[ndarray]) -> ndarray:
-    # The parts would otherwise lie in memory beside the whole.
-    whole = np.concatenate(parts)
-    parts.clear()
-    return whole
+    if not density.min() < level < density.max():
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    vertices, faces, _, _ = measure.marching_cubes(density, level)
+    report("surface", 1.0)
+    # scikit-image's run clockwise where what is dense lies inside.
+    return vertices, np.ascontiguousarray(faces[:, ::-1])
 
 
 def without_floaters(

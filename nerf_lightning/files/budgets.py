@@ -22,8 +22,6 @@ class Budgets:
     """Pixels of one camera's picture."""
     megapixels: int = 178
     """Size of a picture file that is decoded, in millions of pixels."""
-    name_characters: int = 1024
-    """Of the name of a photograph or of a scene."""
     samples_per_ray: int = 1 << 12
     """Points that a model asks its field about along one ray, at once."""
     layer_width: int = 1 << 12
@@ -34,16 +32,8 @@ class Budgets:
     """Of a json file."""
     json_lists: int = 2_000_000
     """Lists and objects in a json file, each of which takes a hundred times its bytes in memory."""
-    json_depth: int = 32
-    """Brackets within brackets in a json file."""
     yaml_characters: int = 1 << 20
     """Of a yaml text."""
-    yaml_depth: int = 50
-    """Brackets within brackets in a yaml text."""
-    override_characters: int = 1 << 16
-    """Of the overrides that are repeated from a folder."""
-    object_bytes: int = 1 << 24
-    """Of that part of a PyTorch file that is not numbers."""
     tensor_bytes: int = 1 << 36
     """Of a PyTorch file."""
     unpacked_bytes: int = 1 << 32

@@ -20,7 +20,7 @@ def read_json(path: Path) -> Any:
     try:
         text = read_text(path, limits().json_bytes, CURE)
         require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
-        content = json.loads(text, object_pairs_hook=_object)
+        return json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
@@ -28,8 +28,6 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path} nests its brackets too deeply to be a capture. {CURE}") from error
     except ValueError as error:  # a number of thousands of digits
         raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
-    _require_flat(content, path)
-    return content
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -38,20 +36,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
         raise ValueError(f"the key {twice[:200]!r} stands twice in one object, and which one holds is not clear")
     return content
-
-
-def _require_flat(content: object, path: Path) -> None:
-    # What follows walks through the content, and prints parts of it, by recursion.
-    level, most = list[Any]([content]), limits().json_depth
-    for _ in range(most):
-        objects = [node.values() for node in level if isinstance(node, dict)]
-        lists = [node for node in level if isinstance(node, list)]
-        level = [child for node in (*objects, *lists) for child in node]
-        if not level:
-            return
-    raise InputError(
-        f"{path} nests its brackets too deeply to be a capture (more than budgets.json_depth={most}). {CURE}"
-    )
 
 
 def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:

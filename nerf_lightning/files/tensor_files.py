@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from nerf_lightning.files.budgets import limits, require_within
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
@@ -28,6 +28,8 @@ CALLED = {
 }
 """What the files of this program, and state dicts, call."""
 ARCHIVE = b"PK\x03\x04"
+OBJECT_BYTES = 1 << 24
+"""Most bytes of that part of a file that is not numbers."""
 LEGACY_PICKLES = 5
 """Magic number, protocol, system, objects, names of the storages; then come the numbers (torch before 1.6)."""
 
@@ -77,7 +79,8 @@ def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
         objects = [entry for entry in entries if entry.filename.lower().endswith("data.pkl")]
         if len(objects) != 1:
             raise zipfile.BadZipFile("no data.pkl")
-        require_within("object_bytes", objects[0].file_size, str(path), "bytes beside its numbers")
+        if objects[0].file_size > OBJECT_BYTES:
+            raise zipfile.BadZipFile(f"{objects[0].file_size:,} bytes beside its numbers")
         return io.BytesIO(archive.read(objects[0]))
 
 

@@ -13,8 +13,8 @@ from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 
-MOST_BITS = 1000
-"""Of a whole number: larger ones are no floating-point numbers, and Python writes only some thousand digits."""
+MOST_DEPTH, MOST_BITS = 50, 1000
+"""Brackets within brackets; bits of a whole number: larger ones are no floating-point numbers."""
 CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
 
@@ -27,8 +27,8 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it holds references (*name), which are not read from files")
         self.depth += 1
-        if self.depth > limits().yaml_depth:
-            raise yaml.YAMLError(f"it nests more than {limits().yaml_depth} deep")
+        if self.depth > MOST_DEPTH:
+            raise yaml.YAMLError(f"it nests more than {MOST_DEPTH} deep")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node

@@ -22,6 +22,7 @@ ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
 UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
 JOINERS = "\u200c\u200d"
+MOST_CHARACTERS = 1024  # Of the name of a photograph or of a scene
 LONGEST_FILE_NAME = 200  # In bytes; file systems take 255, and endings are added
 
 
@@ -96,11 +97,11 @@ def is_plain(name: str) -> bool:
 
 
 def require_printable(name: str, where: str) -> None:
-    """Refuse a name that is not UTF-8 or holds control characters, before anything (`where`) is called by it."""
-    if not is_plain(name):
+    """Refuse a name that is too long, not UTF-8 or holds control characters: `where` would be called by it."""
+    if len(name) > MOST_CHARACTERS or not is_plain(name):
         raise InputError(
-            f"{where} has the name '{for_terminal(name[:200])}', which holds control characters or is not UTF-8. "
-            "Rename it, in the files that list it too."
+            f"{where} has the name '{for_terminal(name[:200])}', which holds control characters, is not UTF-8 or has "
+            f"more than {MOST_CHARACTERS} characters. Rename it, in the files that list it too."
         )
 
 

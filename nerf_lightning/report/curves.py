@@ -33,10 +33,10 @@ class Chart:
     is_logarithmic: bool = False
 
 
-# Only names of these forms are drawn: others may be anything. Older runs have those with train/ and val/.
+# Only names of these forms are drawn: others may be anything.
 CHARTS = (
-    Chart("PSNR (dB)", re.compile(r"(train/psnr_\w{1,40}|val/psnr|PSNR/(train_\w{1,40}|validation))")),
-    Chart("loss", re.compile(r"(train/loss(_\w{1,40})?|Training loss/\w{1,40})"), is_logarithmic=True),
+    Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)")),
+    Chart("loss", re.compile(r"Training loss/\w{1,40}"), is_logarithmic=True),
     Chart("learning rate", re.compile(r"train/learning_rate"), is_logarithmic=True),
     Chart("rays per second", re.compile(r"speed/rays_per_second")),
     Chart("memory (GB)", re.compile(r"memory/\w{1,40}_gigabytes")),
@@ -97,7 +97,7 @@ def _draw(chart: Chart, curves: Mapping[str, Curve]) -> bytes:
 
 
 MOST_POINTS = 1000
-VALIDATION = ("PSNR/validation", "val/psnr")
+VALIDATION = "PSNR/validation"
 FEWEST_POINTS, FEWEST_VALIDATIONS = 3, 8
 """Of fewer points, nobody sees a curve; of fewer validations, that of the batches is taken instead."""
 
@@ -111,8 +111,8 @@ def psnr_curve(run: Path) -> Sequence[float]:
         curves = read_curves(run / "tensorboard")
     except (InputError, OSError):
         return []
-    validated = next((curves[tag][1] for tag in VALIDATION if tag in curves), [])
-    training = [tag for tag in curves if CHARTS[0].tags.fullmatch(tag) and tag not in VALIDATION]
+    validated = curves[VALIDATION][1] if VALIDATION in curves else []
+    training = [tag for tag in curves if CHARTS[0].tags.fullmatch(tag) and tag != VALIDATION]
     of_levels = [curves[tag][1] for tag in training]
     # The last level is the picture.
     values = validated if len(validated) >= FEWEST_VALIDATIONS or not of_levels else of_levels[-1]

@@ -69,19 +69,14 @@ def find_results(
     if not chosen:
         known = (sorted({getattr(result, key) for result in results}) for key in ("scene", "model"))
         there = " and the models ".join(map(listed, known))
-        asked = f"scenes={_as_given(scenes)} and models={_as_given(models)}"
+        given = {"scenes": scenes, "models": models}
+        asked = " and ".join(f"{key}=[{','.join(names)}]" for key, names in given.items() if names is not None)
         raise InputError(f"No run fits {asked}. There are the scenes {there}.")
     return FoundResults(FILES[measured], chosen, [run for run, result in read.items() if result is None])
 
 
 def _fits(name: str, patterns: Sequence[str] | None) -> bool:
     return patterns is None or any(fnmatchcase(name, pattern) for pattern in patterns)
-
-
-def _as_given(patterns: Sequence[str] | None) -> str:
-    if patterns is None:
-        return "null"
-    return patterns[0] if len(patterns) == 1 else f"[{','.join(patterns)}]"
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

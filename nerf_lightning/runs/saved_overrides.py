@@ -16,11 +16,11 @@ from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
 from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, is_removable, meaning_of
-from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
 
+MOST_CHARACTERS = 1 << 16
 OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
@@ -58,7 +58,8 @@ def to_give_again(overrides: Sequence[str], of_sweep: bool = False) -> list[str]
 
 
 def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sweep: bool) -> Iterator[str]:
-    require_within("override_characters", sum(map(len, lines)), str(saved), "characters of overrides")
+    if sum(map(len, lines)) > MOST_CHARACTERS:
+        raise InputError(f"{saved} holds more than {MOST_CHARACTERS:,} characters: give the settings by hand.")
     given = {argument.lstrip("+~").partition("=")[0] for argument in arguments}
     for line in lines:
         override = _parsed(line)

@@ -11,10 +11,10 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
-from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, can_compile, without
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart
+from nerf_lightning.selftest.check import Check, gradient_bound, norm_apart
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -84,8 +84,8 @@ class Training:
         return errors.summary()["val/psnr"]
 
 
-def checks(device: torch.device, precisions: Sequence[MatmulPrecision], compiles: bool) -> list[Check]:
-    """Return the checks of gradients and of whole trainings; `compiles`: torch.compile is tried, too."""
+def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[Check]:
+    """Return the checks of gradients and of whole trainings."""
     found = []
     for method in METHODS:
         for matmul_precision in precisions:
@@ -104,9 +104,7 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision], compiles
                     partial(_psnr, method, device, matmul_precision),
                 ),
             ]
-    bound = gradient_bound("float32", LAYERS)
-    name = "nerf_tiny, compiled: gradients of a batch"
-    return [*found, Check(name, bound, "as without torch.compile", partial(_compiled, device, compiles))]
+    return found
 
 
 @cache
@@ -138,14 +136,3 @@ def _gradients(method: str, device: torch.device, matmul_precision: MatmulPrecis
 
 def _psnr(method: str, device: torch.device, matmul_precision: MatmulPrecision) -> float:
     return abs(Training(method, device, matmul_precision, TILE_POINTS).psnr() - reference_psnr(method))
-
-
-def _compiled(device: torch.device, compiles: bool) -> float:
-    if not compiles:
-        raise CannotRun("torch.compile is tried on GPUs, and on the CPU with trainer.compile=true")
-    if not can_compile(device):
-        raise CannotRun("there is no C++ compiler, which torch.compile needs on the CPU")
-    training = Training("nerf_tiny", device, "float32", None)
-    if not training.step.model.compile_fields():
-        raise ValueError("no level was compiled")
-    return gradients_apart(training.gradients(), reference_gradients("nerf_tiny"))

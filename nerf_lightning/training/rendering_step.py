@@ -38,6 +38,6 @@ def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Train
         progress=Progress(),
         seed=0,
         background=scene.background,
-        tile_points=None if model.needs_whole_batch else settings.tile_points,
+        tile_points=settings.tile_points,
         start_weights=checkpoint.weights,
     )

@@ -140,11 +140,6 @@ class TrainStep:
                 f"and the loss {type(loss).__name__} looks at the samples of single rays, as model=fast_proposal wants "
                 "it. Leave model.subpixels out, or choose another loss or model."
             )
-        if tile_points is not None and model.needs_whole_batch:
-            raise InputError(
-                "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
-                "add trainer.tile_points=null, or leave batch_norm off."
-            )
         self.draw_weights()
 
     def draw_weights(self) -> None:

@@ -1,15 +1,12 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
-import logging
 import math
 import warnings
-import webbrowser
 from collections.abc import Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
@@ -26,8 +23,6 @@ from nerf_lightning.viewer.training_switch import TrainingSwitch
 
 # The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
-
-log = logging.getLogger(__name__)
 
 
 def require_viser() -> Any:
@@ -122,18 +117,3 @@ class Page:
         shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])
         widest = math.radians(MOST_DEGREES)
         return min(fov_that_holds(vertical_field_of_view(cameras, 0), shape, window), widest)
-
-
-def open_in_browser(address: str) -> None:
-    """Open a page in the user's browser, or say why not."""
-    opened = False
-    with suppress(webbrowser.Error):
-        opened = webbrowser.open(address)
-    if not opened:
-        log.warning(
-            "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
-            "ssh -L %s:%s THIS_MACHINE.",
-            address,
-            urlsplit(address).port,
-            urlsplit(address).netloc,
-        )

@@ -50,6 +50,7 @@ class PhotographPanel:
             self._add_controls()
         self._show_pictures()
         session.on_leave = self._left
+        session.photographs.when_read.append(session.queue.errors.harmless(self._show_anew))
 
     def enter(self, view: int) -> None:
         """Look through the camera of a view."""
@@ -97,6 +98,12 @@ class PhotographPanel:
             if 0 <= after < len(self._found):
                 self.first = after
                 self._show_pictures()
+
+    def _show_anew(self) -> None:
+        with self._lock:
+            self._show_pictures()
+            self.frusta.has_cameras = False
+            self.frusta.show(self.frusta.cameras.visible)
 
     def _show_pictures(self) -> None:
         for handle in self._pictures:

@@ -1,5 +1,7 @@
 """The photographs of a capture in the viewer: small ones for the frusta, larger ones to compare with."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from jaxtyping import UInt8
@@ -21,8 +23,17 @@ class Photographs:
     """
 
     def __init__(self, record: SceneRecord, scene: Scene | None, background: Background):
-        self.record, self.scene, self.background = record, scene, background
+        self.record, self.background = record, background
+        self.when_read: list[Callable[[], None]] = []
+        """What is called when pictures have come."""
+        self.take(scene)
+
+    def take(self, scene: Scene | None) -> None:
+        """Show the pictures of a capture from now on."""
+        self.scene = scene
         self._views = {} if scene is None else {name: view for view, name in enumerate(scene.view_names)}
+        for act in self.when_read:
+            act()
 
     @property
     def shown(self) -> list[int]:

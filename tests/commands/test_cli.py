@@ -1,20 +1,24 @@
+import os
 import sys
 
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 from support.configs import yaml_files
+from support.running import said
 
 from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 
 
-def test_help_lists_every_command_with_its_line(nerf):
+def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkeypatch):
     result = nerf("--help")
     assert result.code == 0
     for name in ("train", "eval", "render", "bench", "selftest"):
         assert f"\n  {name}" in result.out
     assert nerf().out == result.out
+    monkeypatch.setenv("COLUMNS", "80")
+    assert [line for line in nerf("--help").out.splitlines() if len(line) > 80] == []
     assert all(summary for summary in find_commands().values())
 
 
@@ -95,17 +99,33 @@ def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
     assert len(result.err.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(("command", "key"), [("render", "ckpt"), ("eval", "ckpt"), ("report", "run")])
+def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypatch, command, key):
+    monkeypatch.chdir(tmp_path)
+    said(nerf(command), f"nerf {command} needs a run, and outputs/ holds none")
+    for age, run in enumerate(["outputs/sweeps/new/0_seed=0", "outputs/bricks/old"]):
+        (tmp_path / run / "checkpoints").mkdir(parents=True)
+        (tmp_path / run / "checkpoints" / "last.ckpt").touch()
+        os.utime(tmp_path / run / "checkpoints" / "last.ckpt", (1e9 - age, 1e9 - age))
+    monkeypatch.chdir(tmp_path)
+    said(nerf(command), f"type: nerf {command} {key}=outputs/sweeps/new/0_seed=0")
+
+
 def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf):
     assert (
         "optimizer.fused is a setting of optimizer=adam, and something else is chosen."
         in nerf("train", "optimizer.fused=true").err
     )
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
+    said(nerf("bench", "experiment=quickstart"), "nerf bench has no setting experiment. It belongs to training")
+    said(nerf("train", "+experiment=quickstart"), "leave the + out. Type experiment=quickstart.")
+    said(nerf("train", "trainer.accumulate_grad_batches=2"), "accumulate_grad_batches is data.batch_rays")
+    said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")
+    said(nerf("train", "scene.downscale=2"), "scene=bricks is rendered, in the size scene.resolution=N")
     assert "+zzzz=VALUE adds one of your own" in nerf("render", "zzzz=1").err
     result = nerf("train", "scene=blender")
     assert result.code == 2
-    assert "scene.root has no value" in result.err
-    assert "scene.root=VALUE" in result.err
+    assert "nerf train needs scene.root: add scene.root=VALUE." in result.err
     result = nerf("train", "model=nerf", "field.skip=20")
     assert result.code == 2
     assert "skip=20 names no layer" in result.err

@@ -130,7 +130,6 @@ def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
         "training rays/s",
         "times plain",
         "whole rays, loss and gradients, share of a step",
-        "watching, share of a step",
     ):
         assert name in result.out
     assert {1, 2} <= set(threads)

@@ -31,7 +31,7 @@ def test_an_explanation_imports_nothing_heavy(words):
 def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_take(nerf):
     result = nerf("help", "data.sample_budget")
     assert result.code == 0
-    assert result.out.startswith("data.sample_budget=65536\n")
+    assert result.out.startswith("data.sample_budget=131072\n")
     assert "so that a step has about so many samples; null: they do not." in " ".join(result.out.split())
     assert "Takes int | null." in result.out
     assert "model=fast_large 524288" in " ".join(result.out.split())
@@ -43,9 +43,32 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert "Takes 'white' | 'black'." in result.out
     assert "what.resolution=256" in nerf("help", "what.resolution").out
     assert nerf("help", "export").out == nerf("export", "--help").out
+    assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
     assert "in the user's units; null: from the capture." in told
     assert "With scene=blender" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("fog", "\n  * The training was short: fog"),
+        ("blurry", "Blurred, though it trained long enough"),
+        ("grey", "The picture is grey"),
+        ("gpu", "\n  trainer=gpu  "),
+        ("learning rate", "  optimizer.lr  "),
+        ("batch size", "  data.batch_rays  "),
+        ("out of memory", "prints the memory plan before training"),
+    ],
+)
+def test_words_that_name_nothing_are_looked_for_in_meanings_and_symptoms(nerf, words, found):
+    assert found in nerf("help", *words.split()).out
+
+
+def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
+    told = nerf("help", "ckpt").out
+    assert "nerf eval: ckpt=(required)\n    The run folder or checkpoint to measure." in told
+    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to look at." in told
 
 
 @pytest.mark.parametrize(

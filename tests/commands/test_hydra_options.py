@@ -60,6 +60,11 @@ def test_options_that_hydra_does_not_know_or_that_do_not_go_together_are_one_par
         said(nerf("train", *arguments), "--")
 
 
+@pytest.mark.parametrize("words", [["--max-steps", "5"], ["--max_steps=5"]])
+def test_a_setting_typed_as_an_option_is_written_out(nerf, words):
+    said(nerf("train", "seed=0", *words), "settings are given without dashes, as key=value. Type trainer.max_steps=5.")
+
+
 @pytest.mark.parametrize("command", ["eval", "render", "view", "report", "table", "train"])
 def test_every_command_shows_its_config(nerf, command):
     result = nerf(command, "-c", "job", "--package", "paths")

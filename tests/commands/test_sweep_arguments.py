@@ -1,5 +1,7 @@
 """What a sweep is asked for, before Hydra reads it."""
 
+import os
+
 import pytest
 from support.configs import composed
 from support.running import start_code
@@ -63,7 +65,8 @@ def test_a_requeued_slurm_job_finds_its_own_sweep(tmp_path, monkeypatch):
 def test_a_plugin_that_is_not_installed_is_named_with_its_extra(tmp_path, group, plugin, extra):
     arguments = ["nerf", "train", "-m", f"hydra/{group}", "seed=0,1", f"paths.output_dir={tmp_path}/out"]
     code = f"import sys; sys.modules['hydra_plugins'] = None; sys.argv = {arguments}; import nerf_lightning.__main__"
-    process = start_code(code)
+    (tmp_path / "srun").touch(mode=0o700)
+    process = start_code(code, env={"PATH": f"{tmp_path}:{os.environ['PATH']}"})
     _, told = process.communicate(timeout=300)
     assert process.returncode == 2, told
     kind = group.partition("=")[0]
@@ -83,3 +86,9 @@ def test_a_typo_is_not_taken_for_a_missing_plugin(nerf):
     result = nerf("train", "-m", "hydra/launcher=joblibb", "seed=0,1")
     assert result.code == 2
     assert "not installed" not in result.err
+
+
+def test_slurm_without_srun_is_refused_before_a_folder_is_taken(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match=r"Slurm's srun, which is not found here.*hydra/launcher=parallel"):
+        sweep_arguments(["-m", "hydra/launcher=slurm", "seed=0,1"])

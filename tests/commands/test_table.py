@@ -228,7 +228,7 @@ def test_rows_are_chosen_and_sorted(table, tmp_path):
     assert [row["model"] for row in ours(table("sort=minutes")[1])] == ["fast_small", "fast", "nerf"]
     assert [row["model"] for row in ours(table("models=fast*")[1])] == ["fast", "fast_small"]
     assert [row["model"] for row in ours(table("models=[nerf,fast_*]")[1])] == ["nerf", "fast_small"]
-    said(table("models=gnt")[0], "models=gnt", "fast, fast_small, nerf")
+    said(table("models=gnt")[0], "No run fits models=[gnt].", "fast, fast_small, nerf")
     said(table("sort=speed")[0], "sort=speed", "frames_per_second")
 
 
@@ -244,13 +244,14 @@ def test_what_nerf_eval_measured_can_be_taken_instead(table, tmp_path):
     assert "runs/b" in " ".join(result.out.split())
 
 
-def test_nothing_to_show_is_said(nerf, table, tmp_path):
+def test_nothing_to_show_is_said(nerf, table, tmp_path, monkeypatch):
     said(nerf("table", tmp_path / "nowhere"), "nowhere", "no such folder")
     (tmp_path / "runs").mkdir()
     said(table()[0], "no run in")
     leave_measured_run(tmp_path / "runs" / "a", None)
     said(table()[0], "None of the 1 runs has a PSNR in metrics.json")
-    said(nerf("table"), "runs has no value")
+    monkeypatch.chdir(tmp_path)
+    said(nerf("table"), "runs=outputs: there is no such folder")
 
 
 def test_pictures_of_several_sizes_are_counted(table, tmp_path):
@@ -309,7 +310,7 @@ def test_curves_stand_in_the_table_and_in_its_page(table, tmp_path):
     run = leave_measured_run(tmp_path / "runs" / "a")
     writer = SummaryWriter(str(run / "tensorboard"))
     for step in range(10):
-        writer.add_scalar("train/psnr_fine", 10.0 + step, 50 * step)
+        writer.add_scalar("PSNR/train_fine", 10.0 + step, 50 * step)
     writer.close()
     leave_measured_run(tmp_path / "runs" / "b", origin={"config": "b"})
     result, rows = table("published=false")

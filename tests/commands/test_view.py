@@ -19,7 +19,6 @@ from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands import view
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.viewer import page as page_module
 
 
 @dataclass
@@ -182,10 +181,3 @@ def test_why_there_are_no_photographs_is_said_and_none_are_guessed(of_unknown_sc
         prepared("view", [f"ckpt={of_unknown_scene}", "photographs=true"])
     assert prepared("view", [f"ckpt={of_unknown_scene}", "photographs=false"])[0] == "photographs=false"
     assert not caplog.text
-
-
-def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):
-    monkeypatch.setattr(page_module.webbrowser, "open", lambda address: False)
-    page_module.open_in_browser("http://127.0.0.1:8080/?token=x")
-    assert "There is no browser here to open. Open http://127.0.0.1:8080/?token=x in one yourself" in caplog.text
-    assert "ssh -L 8080:127.0.0.1:8080 THIS" in caplog.text

@@ -30,7 +30,7 @@ def chosen_for(scene, *overrides):
 
 @pytest.mark.parametrize(
     ("scene", "model", "batch_rays"),
-    [(IN_A_BOX, "fast", 4096), (PHOTOGRAPHS, "fast_proposal", 2048), (FORWARD_FACING, "fast_proposal", 2048)],
+    [(IN_A_BOX, "fast", 8192), (PHOTOGRAPHS, "fast_proposal", 2048), (FORWARD_FACING, "fast_proposal", 2048)],
 )
 def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_rays):
     caplog.set_level("INFO")

@@ -15,7 +15,7 @@ from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.density_mesh import marching_cubes, without_floaters
+from nerf_lightning.export.density_mesh import without_floaters
 from nerf_lightning.export.fused_mesh import depth_rays
 from nerf_lightning.export.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
@@ -44,19 +44,6 @@ def colors_of(mesh):
     visual = mesh.visual
     colors = visual.vertex_colors if hasattr(visual, "vertex_colors") else visual.vertex_attributes["color"]
     return np.asarray(colors)[:, :3].astype(int)
-
-
-def test_blocks_make_the_surface_of_the_whole_and_close_it():
-    axes = [np.linspace(0, 3, size) for size in (23, 31, 18)]
-    x, y, z = np.meshgrid(*axes, indexing="ij")
-    density = (np.sin(2 * x + y) * np.cos(3 * y - z) + np.sin(2 * z)).astype(np.float32)
-    density[[0, -1]], density[:, [0, -1]], density[:, :, [0, -1]] = -3, -3, -3
-    whole, whole_faces = marching_cubes(density, 0.1, silent, block=64)
-    vertices, faces = marching_cubes(density, 0.1, silent, block=7)
-    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
-    assert len(vertices) == len(whole)
-    assert len(faces) == len(whole_faces)
-    assert cKDTree(whole).query(vertices)[0].max() < 1e-5
 
 
 @pytest.mark.parametrize("format", ["ply", "obj", "glb"])

@@ -67,7 +67,7 @@ def test_what_rays_pass_by_has_no_density(kind):
         level.sampler.grid.occupy(torch.zeros_like(level.sampler.grid.possible))
         assert not bool(model.density(points).any())
         half = torch.zeros_like(level.sampler.grid.possible)
-        half[:, 4:] = True
+        half[4:] = True
         level.sampler.grid.occupy(half)
         found = model.density(points)
         torch.testing.assert_close(found > 0, points[:, 0] >= 0)

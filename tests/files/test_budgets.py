@@ -27,7 +27,7 @@ def test_every_command_has_it(command):
 
 
 def test_a_limit_is_raised_by_what_is_typed_alone_and_what_is_too_much_is_said_with_its_setting():
-    allow_as_typed(["scene=npz", "budgets.views=7", "xbudgets.json_depth=3", "budgets.nothing=4"])
+    allow_as_typed(["scene=npz", "budgets.views=7", "xbudgets.points=3", "budgets.nothing=4"])
     assert limits() == Budgets(views=7)
     allow_as_typed([])
     assert limits() == Budgets()

@@ -27,7 +27,6 @@ OF_OS = {"remove"}  # lists have one, too
 ALLOWED = {
     "files/made_folders.py": {"mkdir", "rmdir", "rmtree", "unlink"},
     "files/atomic.py": {"unlink"},  # of temporary files that nobody holds, and its own
-    "files/download.py": {"unlink"},  # of what has arrived
     "files/private.py": {"mkdir"},  # of caches, for the user alone
     "nerf/kernels/backends.py": {"makedirs"},  # the same; this part imports nothing of the program
     "data/bricks/cache.py": {"unlink"},  # of a part in such a cache

@@ -17,6 +17,7 @@ OURS = {
     "cli/process.py": ["print", "open"],
     "cli/help.py": ["read_text"],
     "config/manual/docstrings.py": ["read_text"],
+    "config/manual/search.py": ["read_text"],
     "config/manual/yaml_comments.py": ["read_text"],
     "export/page_file.py": ["read_text"],
     "messages/console.py": ["print"],
@@ -27,7 +28,6 @@ OURS = {
     "training/launch/processes.py": ["open", "read_text"],
     "config/scene_overrides.py": ["read_text"],
     "config/exporters.py": ["read_text"],
-    "viewer/page.py": ["open"],
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "files/html.py": ["read_text"],
@@ -35,7 +35,6 @@ OURS = {
     "selftest/command_line.py": ["read_text"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_text"],
-    "commands/selftest.py": ["read_text"],
     "cli/worker.py": ["load", "load"],
 }
 # For writing, in a folder of its own, or of what was opened by us.
@@ -44,10 +43,10 @@ OTHERWISE = {
     "video/film.py": ["open"],
     "evaluation/metrics_files.py": ["open"],
     "runs/table_files.py": ["open"],
-    "data/bricks/cache.py": ["open", "open"],
+    "data/bricks/cache.py": ["load", "open", "open"],
     "data/bricks/parts.py": ["read_text"],
     "data/pixels/images.py": ["open"],
-    "files/numpy_files.py": ["open", "open"],
+    "files/numpy_files.py": ["load"],
     "data/sfm/gps.py": ["open"],
     "data/sfm/photograph_folder.py": ["open", "open"],
     "data/pixels/decoding.py": ["open"],

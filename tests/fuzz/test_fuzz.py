@@ -40,7 +40,7 @@ from nerf_lightning.video.paths.keyframe_path import KeyframePath
 
 OVERRIDES = ("scene=blender", "model=fast", "optimizer.lr=2e-3", "scene.root='my data'")
 KEYFRAMES = [{"position": [4.0, 0.0, 1.0], "look_at": [0.0, 0.0, 0.5], "fov": 40.0},
-             {"position": [0.0, 4.0, 2.0], "direction": [0.0, -4.0, -1.5], "focal": 30.0}]  # fmt: skip
+             {"position": [0.0, 4.0, 2.0], "look_at": [0.0, 0.0, 0.5]}]  # fmt: skip
 
 
 @dataclass

@@ -52,11 +52,11 @@ def test_what_is_no_film_is_refused(tmp_path):
 def test_known_curves_are_drawn_together_and_unknown_names_are_not():
     steps = [1, 2, 3]
     curves = {
-        "train/psnr_fine": (steps, [10.0, 20.0, 25.0]),
-        "val/psnr": (steps, [10.0, 19.0, 23.0]),
-        "train/loss": (steps, [0.5, 0.0, math.nan]),
+        "PSNR/train_fine": (steps, [10.0, 20.0, 25.0]),
+        "PSNR/validation": (steps, [10.0, 19.0, 23.0]),
+        "Training loss/sum": (steps, [0.5, 0.0, math.nan]),
         "memory/resident_gigabytes": ([], []),
-        "train/loss_$\\evil": (steps, [1.0, 1.0, 1.0]),
+        "Training loss/$\\evil": (steps, [1.0, 1.0, 1.0]),
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
     drawings = {drawing.label: drawing.address for drawing in curve_drawings(curves)}
@@ -69,7 +69,7 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
 
 
 def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
-    curves = {f"train/loss_{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
+    curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
     (drawing,) = curve_drawings(curves)
     assert len(drawing.address) < 200_000
     assert drawing.note == "2988 more curves are in the run's TensorBoard files."

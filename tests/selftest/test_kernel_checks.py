@@ -57,9 +57,6 @@ MISTAKES = {
     "hash grid: gradient of the table": (hash_grid_cpu, "add_table_gradient", table_gradient),
     "hash grid: gradient of the points": (hash_grid_cpu, "point_gradient", off_by_one_percent),
     "march: rays with other intervals": (march_cpu, "march", marching),
-    "march into a fixed capacity: rays with other intervals": (
-        torch, "nonzero_static", lambda right: lambda flat, **options: right(flat, **options).flip(0),
-    ),
     "ragged samples: value": (ragged_cpu, "integrate", off_by_one_percent),
     "ragged samples: gradients": (ragged_cpu, "integrate_gradient", off_by_one_percent),
     "perceptron, float32: value": (mlp_cpu, "forward", rounded),

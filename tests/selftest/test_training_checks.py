@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 
-from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
@@ -16,7 +15,7 @@ from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.training import METHODS
 
-CHECKS = {check.name: check for check in training.checks(training.CPU, ("float32", "bfloat16"), compiles=False)}
+CHECKS = {check.name: check for check in training.checks(training.CPU, ("float32", "bfloat16"))}
 PSNR = f"PSNR after {training.STEPS} steps, dB"
 
 
@@ -77,14 +76,6 @@ def test_an_optimizer_that_is_wrong_shows_in_the_psnr(monkeypatch):
 def test_gradients_that_are_missing_are_named():
     with pytest.raises(ValueError, match="gradients of \\['b'\\]"):
         training.gradients_apart({"a": torch.ones(1)}, {"a": torch.ones(1), "b": torch.ones(1)})
-
-
-def test_torch_compile_is_tried_only_where_it_is_asked_for_and_there_is_a_compiler(monkeypatch):
-    monkeypatch.setattr(backends.shutil, "which", lambda name: None)
-    for compiles, note in ((False, "trainer.compile=true"), (True, "there is no C++ compiler")):
-        row = carried_out(training.checks(training.CPU, ("float32",), compiles)[-1])
-        assert row.outcome == "not run"
-        assert note in row.note
 
 
 COMPILED = """

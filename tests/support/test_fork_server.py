@@ -2,11 +2,10 @@
 
 import os
 import signal
-import subprocess
 import sys
 
 import pytest
-from support.fork_server import PIPE, Forked, fits_a_fork
+from support.fork_server import Forked, fits_a_fork
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere tests start processes of their own")
 
@@ -44,33 +43,6 @@ def test_it_ends_as_any_process(code, expected, words):
     assert (number, words in output) == (expected, True), output
 
 
-def test_signals_reach_it():
-    for number, code in ((signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, -signal.SIGTERM)):
-        process = Forked("-c", "import time; print('ready', flush=True); time.sleep(60)")
-        assert process.stdout.readline() == "ready\n"
-        assert process.poll() is None
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.01)
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.communicate(timeout=0.01)
-        process.send_signal(number)
-        process.communicate(timeout=60)
-        assert process.returncode == code
-        process.kill()
-
-
-def test_each_stream_can_be_a_pipe_and_a_reader_that_left_breaks_it():
-    code = "import sys; print(sys.stdin.read()); print('wrong', file=sys.stderr)"
-    process = Forked("-c", code, stdin=PIPE, stderr=PIPE)
-    process.stdin.write("hello")
-    assert process.communicate(timeout=60) == ("hello\n", "wrong\n")
-    process = Forked("-c", "import time; time.sleep(0.3); print('x', flush=True)", stderr=PIPE)
-    process.stdout.close()
-    with process.stderr:
-        assert "BrokenPipeError" in process.stderr.read()
-    assert process.wait(60) in (1, 120), "120 is what Python says where it still holds what it could not write"
-
-
 def test_what_is_read_at_import_needs_a_process_of_its_own_and_a_call_of_nerf_in_this_one_changes_nothing(monkeypatch):
     assert fits_a_fork(os.environ)
     assert fits_a_fork(os.environ | {"PATH": "/elsewhere"})
@@ -84,13 +56,3 @@ def test_what_is_read_at_import_needs_a_process_of_its_own_and_a_call_of_nerf_in
     assert told("import sys; print(sys.stdout.write_through)") == (0, "True\n")
     monkeypatch.setenv("PYTHONUNBUFFERED", "")
     assert told("import sys; print(sys.stdout.write_through)") == (0, "False\n")
-
-
-def test_it_runs_the_command_line_and_random_numbers_differ_from_fork_to_fork():
-    process = Forked("-m", "nerf_lightning", "trian")
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert output.startswith("nerf: There is no command 'trian'.")
-    code = "import random, numpy, torch; print(random.random(), numpy.random.rand(), torch.rand(()).item())"
-    one, other = told(code)[1].split(), told(code)[1].split()
-    assert all(mine != theirs for mine, theirs in zip(one, other, strict=True))

@@ -31,16 +31,6 @@ def test_a_config_is_what_hydra_composes_alone():
         config.encoder.num_levels = 7  # of one's own
 
 
-def test_a_file_is_read_once(monkeypatch):
-    read = []
-    monkeypatch.setattr(quick_composition, "loaded", lambda repo, path: read.append(path) or LOADED(repo, path))
-    for name in ("_files", "_lists", "_configs"):
-        monkeypatch.setattr(quick_composition, name, {})
-    for steps in ("constant", "exponential", "constant"):
-        compose_config("train", ["model=nerf_tiny", f"scheduler={steps}", "loss=mse"])
-    assert len(read) == len(set(read)) > 20
-
-
 def test_other_values_and_mistakes_are_seen_each_time():
     for lr in (1.0, 2.0):
         assert compose_config("train", ["model=nerf_tiny", f"optimizer.lr={lr}"])[0].optimizer.lr == lr

@@ -1,8 +1,6 @@
 """Whatever of ours a test calls is checked: arguments, results, and that axes of one name have one size."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import pytest
 import torch
@@ -38,20 +36,6 @@ def test_axes_of_one_name_have_one_size_within_a_call_also_in_what_is_returned_a
         weights_from_density(torch.ones(4, 3), torch.ones(4, 2))
 
 
-def test_a_function_made_anew_with_each_call_is_checked_each_time():
-    def outer(scale):
-        @decorated
-        def inner(values: Float[Tensor, " n"], more: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-            return scale * (values + more)
-
-        return inner
-
-    assert outer(2.0)(torch.ones(3), more=torch.ones(3)).tolist() == [4, 4, 4]
-    assert outer(3.0)(torch.ones(2), torch.ones(2)).tolist() == [6, 6]
-    with pytest.raises(TypeCheckError, match="more"):
-        outer(2.0)(torch.ones(3), torch.ones(2))
-
-
 def test_a_dataclass_is_checked_when_it_is_made():
     @checked(typechecker=beartype)
     @dataclass(frozen=True)
@@ -65,47 +49,6 @@ def test_a_dataclass_is_checked_when_it_is_made():
         Pair(torch.ones(3), torch.ones(2))
     with pytest.raises(TypeCheckError, match="name"):
         Pair(torch.ones(3), torch.ones(3), 3)
-
-
-def test_values_that_decide_are_looked_at_each_time():
-    @decorated
-    def named(values: Float[Tensor, " n"], way: Literal["up", "down"]) -> list[Float[Tensor, " n"]]:
-        return [values]
-
-    named(torch.ones(3), "up")
-    with pytest.raises(TypeCheckError, match="way"):
-        named(torch.ones(3), "left")
-
-
-def test_a_generator_is_checked_when_it_is_made_and_its_axes_are_its_own():
-    @decorated
-    def each(values: Float[Tensor, " n"], more: Float[Tensor, " n"]) -> Iterator[Tensor]:
-        yield from values + more
-
-    @decorated
-    def total(values: Float[Tensor, " n"]) -> float:
-        return sum(map(float, each(values[:2], values[:2])))
-
-    assert total(torch.ones(5)) == 4
-    with pytest.raises(TypeCheckError, match="more"):
-        each(torch.ones(3), torch.ones(2))
-
-
-def test_plain_types_and_those_of_methods_and_properties_are_checked():
-    class Box:
-        @decorated
-        def doubled(self, times: int = 2, *, name: "str" = "") -> "str":
-            return name * times
-
-        @property
-        @decorated
-        def wrong(self) -> int:
-            return "no number"
-
-    assert Box().doubled(name="a") == "aa"
-    for call in (lambda: Box().doubled("2"), lambda: Box().doubled(name=3), lambda: Box().wrong):
-        with pytest.raises(TypeCheckError):
-            call()
 
 
 def test_what_passed_once_passes_again_and_nothing_else_does():

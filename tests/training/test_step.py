@@ -49,12 +49,6 @@ def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they
         torch.testing.assert_close(seen.gradient_norms[name], expected)
 
 
-def test_batch_norm_with_tiles_is_refused_by_name():
-    with pytest.raises(InputError, match=r"field\.batch_norm=true .* trainer\.tile_points=null"):
-        make_step(64, tiny_model(batch_norm=True))
-    make_step(None, tiny_model(batch_norm=True))
-
-
 def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     step, steps = make_step(None), []
     optimizer = step.new_optimizer()

@@ -62,6 +62,13 @@ def test_without_photographs_at_hand_there_are_names_and_it_is_said(tmp_path):
     assert not panel.gui.made["Photograph | render"].visible
 
 
+def test_photographs_that_come_later_take_their_places(tmp_path):
+    panel = Panel(tmp_path)
+    panel.controls.photographs.frusta.cameras.visible = False
+    panel.session.photographs.take(ball_scene(num_views=4, size=16))
+    assert "image/jpeg" in buttons(panel)["ball_2"]._icon_html
+
+
 def test_a_name_is_shown_as_text(tmp_path):
     names = ("<iframe srcdoc='<script>1</script>'></iframe>", 'b"><img src=x onerror=1>', "c", "d")
     panel = Panel(tmp_path, view_names=names)

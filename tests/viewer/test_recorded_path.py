@@ -59,13 +59,13 @@ def test_what_the_page_plays_is_what_a_film_shows(filled):
 def test_a_file_that_was_written_by_hand_is_loaded_with_all_that_it_says(path):
     path.folder.mkdir()
     (path.folder / "mine.yaml").write_text(
-        "- {position: [4, 0, 1], direction: [-4, 0, -1], focal: 30}\n"
+        "- {position: [4, 0, 1], look_at: [0, 0, 0], fov: 30}\n"
         "- {position: [0, 4, 2], look_at: [0, 0, 0.5], up: [0, 0.1, 1]}\n"
         "- {position: [-4, 0, 1], look_at: [0, 0, 0.5], fov: 40}\n"
     )
     path.load("mine.yaml")
     assert path.times[-1] == pytest.approx(4.0)  # none are given: at about one speed
-    assert [each.focal for each in path.keyframes] == [30, None, None]
+    assert [each.fov for each in path.keyframes] == [30, None, 40]
     film = KeyframePath(str(path.folder / "mine.yaml"), num_frames=3).cameras(path.around)
     assert torch.allclose(path.view_at(path.curve(), 2.0)[0], film.c2w[1], atol=1e-4)
 
@@ -74,7 +74,7 @@ def test_a_file_that_was_written_by_hand_is_loaded_with_all_that_it_says(path):
     ("text", "why"),
     [
         ("- {position: [0, 0, 1], look_at: [0, 0, 0]}\n", "has 1 keyframe"),
-        ("- {position: [0, 0, 1], direction: [0, 0, 1], up: [0, 0, 2]}\n" * 2, "looks straight along its up"),
+        ("- {position: [0, 0, 1], look_at: [0, 0, 2], up: [0, 0, 2]}\n" * 2, "looks straight along its up"),
     ],
 )
 def test_a_file_that_is_no_path_is_refused_and_the_path_stays(filled, text, why):
@@ -99,7 +99,7 @@ def test_only_plain_files_of_the_folder_are_loaded(filled, tmp_path):
 
 def test_a_camera_whose_picture_has_no_top_is_refused_and_without_its_first_keyframe_a_path_begins_at_the_next(filled):
     with pytest.raises(InputError, match="looks straight along its up"):
-        filled.insert(1, Keyframe((0.0, 0.0, 5.0), direction=(0.0, 0.0, -1.0), up=(0.0, 0.0, 1.0)))
+        filled.insert(1, Keyframe((0.0, 0.0, 5.0), look_at=(0.0, 0.0, 4.0), up=(0.0, 0.0, 1.0)))
     assert len(filled.keyframes) == len(filled.legs) == 3
     filled.legs[1:] = [1.0, 3.0]
     filled.remove(0)

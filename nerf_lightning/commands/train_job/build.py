@@ -7,19 +7,16 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.text import Text
-from rich.tree import Tree
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.overrides import quoted
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding, require_sound
-from nerf_lightning.messages.console import StdoutConsole
+from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import former_config, job_folder
 from nerf_lightning.training.build_run import Run, assemble
@@ -88,7 +85,7 @@ def assemble_job(
     num_rays, data = run.data.batches.whole.num_rays, config.data
     signals, clock = StopSignals(), TrainingTime()
     if config.print_config and ranks.is_first():
-        print_tree(config, StdoutConsole())
+        say(*OmegaConf.to_yaml(config, resolve=True).splitlines())
     return TrainJob(
         **vars(run),
         config=config,
@@ -103,8 +100,12 @@ def assemble_job(
 
 
 def searchpath_override() -> list[str]:
-    """Return the override that names folders with yamls of a person's own, if there is one."""
-    return [each for each in HydraConfig.get().overrides.hydra if each.startswith("hydra.searchpath=")]
+    """Return the override that names folders with yamls of a person's own (`--config-dir`), if there are some."""
+    hydra = HydraConfig.get()
+    named = [source.path for source in hydra.runtime.config_sources if source.provider == "command-line"]
+    if named:
+        return [f"hydra.searchpath={quoted([*hydra.searchpath, *named])}"]
+    return [each for each in hydra.overrides.hydra if each.startswith("hydra.searchpath=")]
 
 
 def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) -> list[Callback]:
@@ -119,20 +120,3 @@ def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) ->
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
     return sorted(callbacks, key=lambda callback: isinstance(callback, Checkpoints))
-
-
-def print_tree(config: DictConfig, console: Console) -> None:
-    """Print a config, resolved, one setting a line; what a section is built of stands beside its name."""
-    tree = Tree("config")
-    _grow(tree, OmegaConf.to_container(config, resolve=True))
-    console.print(tree, soft_wrap=True)
-
-
-def _grow(tree: Tree, node: Any) -> None:
-    for key, value in node.items():
-        if isinstance(value, dict) and value:
-            built = str(value.get("_target_", "")).rpartition(".")[2]
-            branch = tree.add(Text(for_terminal(f"{key}  ({built})" if built else str(key)), style="bold"))
-            _grow(branch, {name: each for name, each in value.items() if not str(name).startswith("_")})
-        else:
-            tree.add(Text(for_terminal(f"{key}: {OmegaConf.to_yaml([value]).strip()[2:]}")))

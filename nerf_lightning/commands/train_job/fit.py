@@ -72,7 +72,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     settings.prepare(step.model)
     job.system.record["precision"] = settings.precision
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN
-    if former is None and measures_tile and not step.model.needs_whole_batch:
+    if former is None and measures_tile:
         tile = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
         step.tile_points = settings.tile_points = tile
     if ranks.is_first():

@@ -87,7 +87,7 @@ def _step(
 
     def held(tile_rays: int, parts: int) -> int:
         points = model.points_per_ray(training=True)
-        step.tile_points = None if model.needs_whole_batch else int((tile_rays + 0.5) * points)
+        step.tile_points = int((tile_rays + 0.5) * points)
         some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
 
         def work() -> None:

@@ -11,6 +11,8 @@ from nerf_lightning.files.folders import conf_file, option_names
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""
+REQUIRED = "(required)"
+"""Stands for the value of a setting that has none until somebody gives it."""
 TAKES = {"bool": "bool", "int": "int", "float": "float", "seq": "list"}
 
 
@@ -35,8 +37,8 @@ class Option(NamedTuple):
 
     typed: str
     """How it is chosen, such as `scene=colmap`."""
-    about: list[str]
-    """The comment at the top of its yaml, and the docstring of what it builds."""
+    about: str
+    """The comment at the top of its yaml; without one, the docstring of what it builds."""
     is_global: bool
     settings: list[Setting]
     """Its own, those of the options that it is based on, and of those that it chooses for its parts."""
@@ -122,7 +124,7 @@ def read_option(group: str, name: str) -> Option:
     entries, chosen = _merged(file, folder, "" if file.is_global else f"{section}.")
     settings = _settings(entries, typed, lambda key: root(key) == root(section))
     maker = _maker(entries, section)
-    about = [text for text in (file.header, maker and maker.summary) if text]
+    about = file.header or (maker.summary if maker else "")
     parts = (read_option(part, name) for part, name in chosen.items() if "@" in part)
     return Option(typed, about, file.is_global, settings + [each for part in parts for each in part.settings], chosen)
 
@@ -162,7 +164,7 @@ def _settings(entries: dict[str, Entry], source: str, is_own: Callable[[str], bo
         takes = argument.takes if argument else TAKES.get(entry.type, "")
         meaning = " ".join(sentence(text, takes) for text in texts if text)
         if not name.startswith("_"):
-            found[key] = Setting(key, entry.text, takes, meaning, source, is_own(key))
+            found[key] = Setting(key, entry.text.replace("???", REQUIRED), takes, meaning, source, is_own(key))
     return list(found.values())
 
 

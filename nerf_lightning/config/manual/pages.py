@@ -24,7 +24,7 @@ def command_page(command: Command, width: int) -> str:
         if kind == "GROUPS":
             return "\n".join(_groups(command, names, width))
         meanings = {each.key: brief(each.meaning) for each in reversed(command.settings) if each.is_own}
-        return "\n".join(_row(f"{key}={command.default(key)}", meanings[key], width) for key in names)
+        return "\n".join(row(f"{key}={command.default(key)}", meanings[key], width) for key in names)
 
     return PLACEHOLDER.sub(listed, command.template).rstrip()
 
@@ -39,7 +39,7 @@ def page_of(command: Command, word: str, width: int) -> str | None:
         if value:
             raise InputError(f"There is no {word}.{did_you_mean(value, options, f'{name}=')}")
         if len(options) > 1:
-            rows = [_row(key, brief(option.about[0]), width) for key, option in options.items()]
+            rows = [row(key, brief(option.about), width) for key, option in options.items()]
             return "\n".join([f"{group}=OPTION", "", *rows, "", f"nerf help {group}=OPTION lists the settings of one."])
     below = [each for each in command.settings if f"{each.key}.".startswith(f"{name}.")]
     about = [_described(each, width) for each in below if each.key == name and not each.text][:1]
@@ -59,12 +59,14 @@ def brief(text: str) -> str:
 def _groups(command: Command, in_full: list[str], width: int) -> Iterator[str]:
     for group in sorted(command.groups, key=lambda group: group not in in_full):
         options = command.options[group]
-        default = f" (default {command.chosen[group].typed.partition('=')[2]})" if group in command.chosen else ""
+        chosen = command.chosen.get(group)
+        default = chosen.typed.partition("=")[2] if chosen else "the run's" if group == "scene" else ""
+        default = f" (default {default})" if default else ""
         if group in in_full:
             yield f"  {group}{default}"
-            yield from (_row(f"  {option.typed}", brief(option.about[0]), width) for option in options)
+            yield from (row(f"  {option.typed}", brief(option.about), width) for option in options)
         elif len(options) > 1:
-            yield _row(group, ", ".join(option.typed.partition("=")[2] for option in options) + default, width)
+            yield row(group, ", ".join(option.typed.partition("=")[2] for option in options) + default, width)
 
 
 def _option_page(option: Option, width: int) -> str:
@@ -72,7 +74,7 @@ def _option_page(option: Option, width: int) -> str:
     of_others = [f"{each.key}={each.text}" for each in option.settings if each.text and not each.is_own]
     lists = [f"{word} {', '.join(what)}" for word, what in (("Chooses", chosen), ("Sets", of_others)) if what]
     own = [_described(each, width) for each in option.settings if each.text and each.is_own]
-    return "\n\n".join([option.typed, *(_paragraph(text, width, 2) for text in option.about + lists), *own])
+    return "\n\n".join([option.typed, *(_paragraph(text, width, 2) for text in [option.about, *lists]), *own])
 
 
 def _setting_page(command: Command, key: str, width: int) -> str:
@@ -95,10 +97,11 @@ def _described(setting: Setting, width: int) -> str:
     return "\n".join([*lines, *([_paragraph(f"Takes {setting.takes}", width, 4)] if setting.takes else [])])
 
 
-def _row(left: str, right: str, width: int) -> str:
+def row(left: str, right: str, width: int) -> str:
+    """Return a line of a list: a name and, from a column on, what it means."""
     start, indent = f"  {left:<{COLUMN - 3}} ", " " * COLUMN
     if len(start) > COLUMN:
-        return f"{start}\n{fill(right, width, initial_indent=indent, subsequent_indent=indent)}"
+        return f"{start.rstrip()}\n{fill(right, width, initial_indent=indent, subsequent_indent=indent)}"
     return fill(right, width, initial_indent=start, subsequent_indent=indent, break_long_words=False)
 
 

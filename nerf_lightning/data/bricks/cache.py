@@ -15,7 +15,6 @@ from filelock import FileLock
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from nerf_lightning.files.numpy_files import archive_headers, read_member
 from nerf_lightning.files.private import make_own_folder, open_own
 from nerf_lightning.messages.errors import InputError
 
@@ -62,12 +61,12 @@ def _load(path: Path, pixels: int) -> Rendered | None:
         return None
     sound = {"rgba": ((pixels, 4), "uint8"), "depth": ((pixels,), "float32"), "normals": ((pixels, 3), "float32")}
     try:
-        with open_own(path, None) as file, zipfile.ZipFile(file) as archive:
-            headers = archive_headers(archive, list(sound))
-            for name, expected in sound.items():
-                if (headers[name].shape, headers[name].dtype) != expected:
-                    raise ValueError(f"{name} is {headers[name].shape} of {headers[name].dtype}")
-            return Rendered(**{name: read_member(archive, name) for name in sound})
+        with open_own(path, None) as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: np.asarray(archive[name]) for name in sound}
+        for name, array in arrays.items():
+            if (array.shape, array.dtype) != sound[name]:
+                raise ValueError(f"{name} is {array.shape} of {array.dtype}")
+        return Rendered(**arrays)
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile, InputError) as error:
         logger.warning("The cached bricks scene %s is damaged (%s): it is rendered anew.", path, error)
         return None

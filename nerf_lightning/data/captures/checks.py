@@ -58,7 +58,6 @@ def usable(capture: Capture) -> Capture:
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
             # Those that are left out are shown, and nothing is called by them.
-            require_within("name_characters", len(view.name), str(capture.source), "characters in a name")
             require_printable(view.name, f"A photograph of {capture.source}")
             if fault := _fault_of(view, capture.lens_model):
                 raise InputError(f"{capture.source}: the view {view.name} {fault}")
@@ -240,9 +239,6 @@ def check_scene(scene: SceneRecord, where: str) -> None:
     """
     names, views = scene.view_names, len(scene.view_names)
     require_within("views", views, where, "views")
-    require_within(
-        "name_characters", max(map(len, (scene.name, *names, *scene.captures))), where, "characters in a name"
-    )
     for name in (scene.name, *names, *scene.captures):
         require_printable(name, where)
     if len(set(names)) < views or not names:  # files and tables are written by it

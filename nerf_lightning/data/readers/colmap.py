@@ -4,7 +4,7 @@ import logging
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from nerf_lightning.data.readers.colmap_files import (
 )
 from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.files.links import is_absolute
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, rotation_from_quaternion
@@ -59,8 +60,6 @@ FILES = ("cameras", "images", "points3D")
 KINDS: dict[str, BinaryFiles | TextFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
 NO_POINTS = ColmapPoints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
 PLY = "points3D.ply"
-TOLERANCE = 1e-4
-"""Relative and absolute, to which a model and its twin in text agree: few digits may have been written."""
 
 log = logging.getLogger(__name__)
 
@@ -243,55 +242,34 @@ def models_in(root: Path) -> list[Path]:
 def _number_of_images(folder: Path) -> int:
     """Return how many photographs a model has; 0 where its list is absent or damaged, which is said if it is read."""
     try:
-        return max(
-            kind.number_of_images(path)
-            for ending, kind in KINDS.items()
-            if (path := folder / f"images{ending}").is_file()
-        )
-    except (InputError, ValueError):
+        with reading(folder):
+            return max(
+                kind.number_of_images(path)
+                for ending, kind in KINDS.items()
+                if (path := folder / f"images{ending}").is_file()
+            )
+    except InputError:
         return 0
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model, binary or text; refuse one that is not whole, or two that disagree."""
-    models = [_read_kind(folder, ending) for ending in KINDS if (folder / f"cameras{ending}").is_file()]
-    if len(models) == 2 and not _agree(*models):
-        raise InputError(
-            f"{folder} holds the model twice, and its binary and its text files disagree. Remove the files of the "
-            "older one (compare their dates)."
-        )
-    model = models[0]
-    if not model.images:
-        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
-    return model
-
-
-def _read_kind(folder: Path, ending: str) -> ColmapModel:
+    """Read a model, binary where there are two; refuse one that is not whole."""
+    ending = next((ending for ending in KINDS if (folder / f"cameras{ending}").is_file()), ".txt")
+    if ending == ".bin" and (folder / "cameras.txt").is_file():
+        log.info("%s holds a model in binary and in text: the binary one is read", folder)
     cameras_path, images_path, points_path = (folder / f"{name}{ending}" for name in FILES)
-    if not images_path.is_file():
-        raise InputError(f"{folder} holds {cameras_path.name} but no {images_path.name}: it is not whole. {CURE}")
     files = KINDS[ending]
-    cameras = list(files.cameras(cameras_path))
+    with reading(cameras_path, CURE):
+        cameras = list(files.cameras(cameras_path))
     twice = [number for number, count in Counter(camera.number for camera in cameras).items() if count > 1]
     if twice:
         raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
-    images = sorted(files.images(images_path), key=lambda image: image.name)
-    points = files.points(points_path) if points_path.exists() else NO_POINTS
+    with reading(images_path, CURE):
+        images = sorted(files.images(images_path), key=lambda image: image.name)
+    if not images:
+        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
+    with reading(points_path, CURE):
+        points = files.points(points_path) if points_path.exists() else NO_POINTS
     if points is NO_POINTS and (folder / PLY).is_file():
         points = read_ply_points(folder / PLY)
     return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
-
-
-def _agree(a: ColmapModel, b: ColmapModel) -> bool:
-    if [image.name for image in a.images] != [image.name for image in b.images]:
-        return False
-    pairs = zip(_numbers_of(a), _numbers_of(b), strict=True)
-    return all(len(x) == len(y) and np.allclose(x, y, rtol=TOLERANCE, atol=TOLERANCE) for x, y in pairs)
-
-
-def _numbers_of(model: ColmapModel) -> Iterable[list[float]]:
-    for image in model.images:
-        camera = model.cameras.get(image.camera)
-        intrinsics = (float(camera.width), float(camera.height), *camera.params) if camera else ()
-        # A quaternion and its negative are one rotation, and have the same products.
-        yield [*np.outer(image.rotation, image.rotation).ravel().tolist(), *image.translation, *intrinsics]

@@ -1,6 +1,7 @@
 """The files of a COLMAP model (colmap.github.io/format.html), binary or text: cameras, photographs, sparse points.
 
-They are parsed here, every length checked before it is believed: COLMAP's own library hangs on some truncated ones.
+They are parsed here: COLMAP's own library hangs on some truncated ones. What a damaged file raises is for the caller
+to catch (`files.trust.reading`).
 """
 
 import io
@@ -19,6 +20,7 @@ from numpy import ndarray
 
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import encoding_of, open_regular
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 
 MODELS = {
@@ -139,64 +141,48 @@ class BinaryFiles:
 
 
 class _Bytes:
-    """A file's bytes, taken in order; what is not there is named."""
+    """A file's bytes, taken in order."""
 
     def __init__(self, path: Path):
         self.path, self.place = path, 0
         self.data: bytes | mmap.mmap
-        try:
-            with open_regular(path, MOST_BYTES, CURE) as file:
-                # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
-                empty = os.fstat(file.fileno()).st_size == 0
-                self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+        with open_regular(path, MOST_BYTES, CURE) as file:
+            # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
+            empty = os.fstat(file.fileno()).st_size == 0
+            self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def take(self, form: str) -> tuple:
-        place = self.place
+        values = struct.unpack_from(form, self.data, self.place)
         self.skip(struct.calcsize(form))
-        return struct.unpack_from(form, self.data, place)
+        return values
 
     def count(self, least_bytes: int, budget: str) -> int:
         """Return the length of a list whose entries take at least so many bytes."""
         count = int(self.take("<Q")[0])
-        self._need(count * least_bytes)
+        if count * least_bytes > len(self.data) - self.place:
+            raise ValueError(f"it announces {count:,} entries, and has {len(self.data)} bytes")
         require_within(budget, count, str(self.path), budget)
         return count
 
-    def skip(self, size: int) -> None:
-        self._need(size)
-        self.place += size
-
     def numbers(self, kind: str, count: int) -> ndarray:
         """Return numbers of one kind, in memory of their own."""
-        place = self.place
-        self.skip(np.dtype(kind).itemsize * count)
-        return np.frombuffer(self.data, kind, count, place).copy()
+        numbers = np.frombuffer(self.data, kind, count, self.place).copy()
+        self.skip(numbers.nbytes)
+        return numbers
+
+    def skip(self, size: int) -> None:
+        self.place += size
 
     def text(self) -> str:
         end = self.data.find(b"\0", self.place)
         if end < 0:
-            self._need(len(self.data) + 1)
+            raise ValueError("it ends within a name")
         name, self.place = self.data[self.place : end], end + 1
-        try:
-            return name.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{self.path} holds a file name that is not UTF-8: {name!r}. {CURE}") from error
+        return name.decode("utf-8")
 
     def end(self) -> None:
-        if self.place < len(self.data):
-            raise InputError(
-                f"{self.path} goes on for {len(self.data) - self.place} bytes after what it announces: it is damaged "
-                f"or is no such file. {CURE}"
-            )
-
-    def _need(self, size: int) -> None:
-        if self.place + size > len(self.data):
-            raise InputError(
-                f"{self.path} ends after {len(self.data)} bytes, in the middle of what it announces: it was cut short "
-                f"or is no such file. {CURE}"
-            )
+        if self.place != len(self.data):
+            raise ValueError(f"it announces {self.place:,} bytes, and has {len(self.data):,}")
 
 
 class TextFiles:
@@ -205,26 +191,29 @@ class TextFiles:
     def cameras(self, path: Path) -> Iterator[ColmapCamera]:
         """Return the cameras."""
         for where, line in _within(_lines(path), "views", path):
-            number, word, *values = [*line.split(), "", ""]
-            model = word.upper()
-            if model not in COUNTS:
-                raise InputError(f"{where} holds a camera of the unknown model {word!r}. {CURE_MODEL}")
-            width, height, *params = _numbers(values[:-2], where, 2 + COUNTS[model])
-            sides = _whole(width, where), _whole(height, where)
-            yield ColmapCamera(_whole(_numbers([number], where, 1)[0], where), model, *sides, tuple(params))
+            with reading(where, CURE):
+                number, model, width, height, *params = line.split()
+                model = model.upper()
+                if model not in COUNTS:
+                    raise InputError(f"{where} holds a camera of the unknown model {model!r}. {CURE_MODEL}")
+                if len(params) != COUNTS[model]:
+                    raise ValueError(f"{model} has {COUNTS[model]} parameters, not {len(params)}")
+                sides = int(float(width)), int(float(height))
+                yield ColmapCamera(int(number), model, *sides, tuple(map(float, params)))
 
     def images(self, path: Path) -> Iterator[ColmapImage]:
         """Return the photographs, each of which takes two lines; the second one, with its features, may be empty."""
         lines = _lines(path, keep_empty=True)
         # COLMAP, too, passes over empty lines before a photograph, but not where features are due.
         for where, line in _within(((where, line) for where, line in lines if line), "views", path):
-            words = line.split(maxsplit=9)
-            qw, qx, qy, qz, x, y, z, camera = _numbers(words[1:9], where, 8)
-            if len(words) < 10:
-                raise InputError(f"{where} lacks the photograph's name. {CURE}")
-            _check_features(next(lines, ("", ""))[1].split(), where)
-            number = _whole(_numbers(words[:1], where, 1)[0], where)
-            yield ColmapImage(number, words[9], _whole(camera, where), (qw, qx, qy, qz), (x, y, z))
+            with reading(where, CURE):
+                number, *numbers, camera, name = line.split(maxsplit=9)
+                qw, qx, qy, qz, x, y, z = map(float, numbers)
+                # Where the lines of features are missing, every second photograph would be taken for one.
+                features = next(lines, ("", ""))[1].split()
+                if len(features) % 3 or (features and int(features[-1]) < -1):
+                    raise ValueError("the next line must hold features (x, y, number of the point), or be empty")
+                yield ColmapImage(int(number), name, int(camera), (qw, qx, qy, qz), (x, y, z))
 
     def number_of_images(self, path: Path) -> int:
         """Return how many photographs a file holds."""
@@ -234,11 +223,11 @@ class TextFiles:
         """Return the sparse points."""
         found, tracks, lengths = array("d"), array("q"), array("q")
         for where, line in _within(_lines(path), "points", path):
-            words = line.split(maxsplit=8 + 2 * LONGEST_TRACK)
-            # Only the position must be there; what else is odd tells nothing of where the point was seen.
-            track = [int(image) for image in words[8 : 8 + 2 * LONGEST_TRACK : 2] if image.isdecimal()]
-            found.extend(_numbers(words[1:4], where, 3))
-            found.append(_error(words))
+            with reading(where, CURE):
+                words = line.split(maxsplit=8 + 2 * LONGEST_TRACK)
+                x, y, z = map(float, words[1:4])
+                found.extend((x, y, z, float(words[7]) if len(words) > 7 else math.nan))
+                track = [int(image) for image in words[8 : 8 + 2 * LONGEST_TRACK : 2] if image.isdecimal()]
             tracks.extend(track)
             lengths.append(len(track))
         numbers = (np.frombuffer(each, np.int64) for each in (tracks, lengths))
@@ -247,20 +236,15 @@ class TextFiles:
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
     """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
-    try:
-        with (
-            open_regular(path, MOST_BYTES, CURE) as binary,
-            io.TextIOWrapper(binary, encoding_of(binary), newline="\n") as file,
-        ):
-            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
-                if len(line) > LONGEST_LINE:
-                    raise InputError(f"{path}, line {number} has more than {LONGEST_LINE:,} characters. {CURE}")
-                if not line.startswith("#") and (keep_empty or line.strip()):
-                    yield f"{path}, line {number}", line.strip()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (it is not UTF-8). {CURE}") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+    with (
+        open_regular(path, MOST_BYTES, CURE) as binary,
+        io.TextIOWrapper(binary, encoding_of(binary), newline="\n") as file,
+    ):
+        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
+            if len(line) > LONGEST_LINE:
+                raise ValueError(f"line {number} has more than {LONGEST_LINE:,} characters")
+            if not line.startswith("#") and (keep_empty or line.strip()):
+                yield f"{path}, line {number}", line.strip()
 
 
 def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterator[tuple[str, str]]:
@@ -273,41 +257,3 @@ def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterat
                 f"add budgets.{budget}=N; else use another file."
             )
         yield line
-
-
-def _check_features(words: list[str], where: str) -> None:
-    # Where the lines of features are missing, every second photograph would be taken for one.
-    try:
-        features = len(words) % 3 == 0 and (not words or int(words[-1]) >= -1)
-    except ValueError:
-        features = False
-    if not features:
-        raise InputError(
-            f"{where}: the line after it must hold the photograph's features (x, y, number of the point) or be empty. "
-            f"{CURE}"
-        )
-
-
-def _numbers(words: list[str], where: str, count: int) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise InputError(
-            f"{where} should hold {count} numbers there, but it holds {' '.join(words) or 'nothing'}. {CURE}"
-        )
-    return values
-
-
-def _error(words: list[str]) -> float:
-    try:
-        return float(words[7])
-    except (ValueError, IndexError):
-        return math.nan
-
-
-def _whole(value: float, where: str) -> int:
-    if not value.is_integer():  # neither are NaN and infinity
-        raise InputError(f"{where} should hold a whole number where {value:g} stands. {CURE}")
-    return int(value)

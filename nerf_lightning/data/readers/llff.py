@@ -19,8 +19,8 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 
@@ -129,15 +129,9 @@ def _rows(path: Path) -> Float[ndarray, "views 17"]:
             f"{path} does not exist; the folder holds {contents(path.parent)}. "
             "Point scene.root at the folder that has it."
         )
-    try:
-        # Read by its own format: np.load would open archives too, and unpickle what is neither.
-        with open_regular(path, MOST_BYTES, CURE) as file:
-            # Its size is known before memory is taken, and its header is short.
-            array_header(file.read(HEADER_BYTES), os.fstat(file.fileno()).st_size)
-            file.seek(0)
-            rows = np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
+    # Read by its own format: np.load would open archives too, and unpickle what is neither.
+    with reading(path, CURE), open_regular(path, MOST_BYTES, CURE) as file:
+        rows = np.lib.format.read_array(file, allow_pickle=False)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":
         shape = " x ".join(map(str, rows.shape)) or "a single number"
         raise InputError(

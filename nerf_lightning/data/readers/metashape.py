@@ -20,6 +20,7 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
@@ -121,10 +122,8 @@ def _is_ours(path: Path) -> bool:
 
 def _chunk(text: str, path: Path) -> Element:
     """Return the first chunk that has aligned cameras, or else the first with cameras."""
-    try:
+    with reading(path, CURE):
         document = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path} is not valid xml: {error}. {CURE}") from error
     chunks = [chunk for chunk in document.iterfind("chunk") if chunk.find("cameras//camera") is not None]
     if not chunks:
         raise InputError(f"{path} holds no chunk of cameras. {CURE}")

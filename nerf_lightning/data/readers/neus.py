@@ -2,7 +2,6 @@
 
 import logging
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +18,9 @@ from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.numpy_files import archive_headers, read_member
+from nerf_lightning.files.numpy_files import open_archive
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz
@@ -78,18 +78,17 @@ class NeusReader(CaptureReader):
 
 def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
     """Return the world and the scale matrices by their numbers."""
-    try:
-        with open_regular(path, MOST_BYTES, CURE) as file, zipfile.ZipFile(file) as archive:
-            keys = [Path(name).stem for name in archive.namelist()]
-            found: dict[str, dict[int, ndarray]] = {"world": {}, "scale": {}}
-            wanted = [match for key in keys if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
-            require_within("views", len(wanted) // 2, str(path), "views")
-            headers = archive_headers(archive, [match[0] for match in wanted])
-            for match in wanted:
-                if headers[match[0]].shape == (4, 4):
-                    found[match[1]][int(match[2])] = np.asarray(read_member(archive, match[0]), np.float64)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise InputError(f"{path} cannot be read: {error}. {CURE}") from error
+    with (
+        reading(path, CURE),
+        open_regular(path, MOST_BYTES, CURE) as file,
+        open_archive(file, path, MOST_BYTES, CURE) as archive,
+    ):
+        found: dict[str, dict[int, ndarray]] = {"world": {}, "scale": {}}
+        wanted = [match for key in archive if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
+        require_within("views", len(wanted) // 2, str(path), "views")
+        for match in wanted:
+            if np.shape(matrix := archive[match[0]]) == (4, 4):
+                found[match[1]][int(match[2])] = np.asarray(matrix, np.float64)
     if not found["world"]:
         raise InputError(
             f"{path} holds no world_mat_0, world_mat_1, ... of 4 x 4 numbers, as NeuS and IDR have. {CURE}"

@@ -1,9 +1,6 @@
 """The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a numpy archive."""
 
-import zipfile
-import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +20,7 @@ from nerf_lightning.data.readers.base import GivenFrameReader
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
 from nerf_lightning.files.links import is_there
-from nerf_lightning.files.numpy_files import ArrayHeader, archive_headers, check_unpacked, read_member
+from nerf_lightning.files.numpy_files import open_archive
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
@@ -33,6 +30,8 @@ from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
 LAYOUT = "It needs images (n, height, width, 3), poses (n, 4, 4) camera-to-world and one focal length in pixels."
+ALLOW = "If you trust it, allow more with scene.max_gigabytes=N; else use another file."
+CURE = f"Remove it, and copy or download it again. {LAYOUT}"
 
 
 @dataclass
@@ -68,8 +67,7 @@ class NpzReader(GivenFrameReader):
         path = Path(self.path)
         if self.download and not path.exists():
             fetch(self.download["url"], path, self.download["bytes"], self.download["sha256"])
-        with reading(path):
-            images, poses, focal = _load(path, self.max_gigabytes)
+        images, poses, focal = _load(path, self.max_gigabytes)
         count, height, width, _ = images.shape
         self.check_divisible(width, height)
         left_out, views = LeftOut(str(path)), []
@@ -111,16 +109,17 @@ def _load(path: Path, max_gigabytes: float) -> tuple[np.ndarray, np.ndarray, flo
     """Return images, poses and the focal length; nothing in the file is executed (no pickles)."""
     if not is_there(path):
         raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
-    try:
-        # What is taken of it is bounded by its headers.
-        with open_regular(path, None) as file, zipfile.ZipFile(file) as archive:
-            headers = archive_headers(archive, KEYS)
-            _check_headers(headers, [Path(name).stem for name in archive.namelist()], path, max_gigabytes)
-            images, poses, focal = (read_member(archive, key) for key in KEYS)
-    except (zipfile.BadZipFile, OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
-        raise InputError(_damaged(path, error)) from error
+    with (
+        reading(path, CURE),
+        open_regular(path, None) as file,
+        open_archive(file, path, 1e9 * max_gigabytes, ALLOW) as archive,
+    ):
+        if missing := [key for key in KEYS if key not in archive]:
+            raise InputError(f"{path} lacks {listed(missing)}; it has {listed(archive) or 'nothing'}. {LAYOUT}")
+        images, poses, focal = (np.asarray(archive[key]) for key in KEYS)
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise InputError(f"{path}: images has the shape {images.shape}. {LAYOUT}")
+    require_within("views", len(images), str(path), "views")
     if images.dtype != np.uint8 and images.dtype.kind != "f":
         raise InputError(
             f"{path}: images has the type {images.dtype}, but it must be floating point in 0..1, or uint8."
@@ -133,22 +132,6 @@ def _load(path: Path, max_gigabytes: float) -> tuple[np.ndarray, np.ndarray, flo
     if focal.size != 1 or focal.dtype.kind not in "fiu":
         raise InputError(f"{path}: focal must be one number of pixels. {LAYOUT}")
     return images, poses, float(focal.reshape(-1)[0])
-
-
-def _damaged(path: Path, error: Exception) -> str:
-    with suppress(OSError), open_regular(path, None) as file:
-        if file.read(6) == b"\x93NUMPY":
-            return f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}"
-    return f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."
-
-
-def _check_headers(headers: dict[str, ArrayHeader], present: list[str], path: Path, max_gigabytes: float) -> None:
-    missing = [key for key in KEYS if key not in headers]
-    if missing:
-        raise InputError(f"{path} lacks {listed(missing)}; it has {listed(present) or 'nothing'}. {LAYOUT}")
-    require_within("views", headers["images"].shape[0] if headers["images"].shape else 0, str(path), "views")
-    cure = "If you trust it, allow more with scene.max_gigabytes=N; else use another file."
-    check_unpacked(path, sum(header.num_bytes for header in headers.values()), 1e9 * max_gigabytes, cure)
 
 
 def _pixels(images: Shaped[np.ndarray, "n h w 3"], downscale: int, path: Path) -> PixelStore:

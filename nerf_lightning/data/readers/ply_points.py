@@ -8,6 +8,7 @@ import numpy as np
 from nerf_lightning.data.readers.colmap_files import ColmapPoints
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 
 MOST_BYTES = 1 << 34
@@ -27,28 +28,25 @@ def read_ply_points(path: Path) -> ColmapPoints:
     Raises:
         InputError: no PLY file, one that is cut short, or more points than a person has agreed to.
     """
-    try:
-        with open_regular(path, MOST_BYTES, CURE) as file:
-            head = file.read(MOST_HEADER)
-            end = head.find(b"end_header")
-            body = head.find(b"\n", end) + 1
-            if not head.startswith(b"ply") or end < 0 or body == 0:
-                raise InputError(f"{path} is not a PLY file. {CURE}")
-            order, count, kind = _header(head[:end].decode("ascii", "replace"), path)
-            require_within("points", count, str(path), "points")
-            file.seek(body)
-            if order == "ascii":
-                rows = np.loadtxt(file, max_rows=count, ndmin=2, comments=None) if count else np.zeros((0, 3))
-                if len(rows) < count:
-                    raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
-                columns = [rows[:, list(kind.names or ()).index(axis)] for axis in "xyz"]
-            else:
-                if os.fstat(file.fileno()).st_size - body < count * kind.itemsize:
-                    raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
-                table = np.frombuffer(file.read(count * kind.itemsize), kind, count)
-                columns = [table[axis] for axis in "xyz"]
-    except (OSError, ValueError, IndexError) as error:
-        raise InputError(f"{path} cannot be read as PLY: {error}. {CURE}") from error
+    with reading(path, CURE), open_regular(path, MOST_BYTES, CURE) as file:
+        head = file.read(MOST_HEADER)
+        end = head.find(b"end_header")
+        body = head.find(b"\n", end) + 1
+        if not head.startswith(b"ply") or end < 0 or body == 0:
+            raise InputError(f"{path} is not a PLY file. {CURE}")
+        order, count, kind = _header(head[:end].decode("ascii", "replace"), path)
+        require_within("points", count, str(path), "points")
+        file.seek(body)
+        if order == "ascii":
+            rows = np.loadtxt(file, max_rows=count, ndmin=2, comments=None) if count else np.zeros((0, 3))
+            if len(rows) < count:
+                raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
+            columns = [rows[:, list(kind.names or ()).index(axis)] for axis in "xyz"]
+        else:
+            if os.fstat(file.fileno()).st_size - body < count * kind.itemsize:
+                raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
+            table = np.frombuffer(file.read(count * kind.itemsize), kind, count)
+            columns = [table[axis] for axis in "xyz"]
     positions = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
     return ColmapPoints(positions, np.full(len(positions), np.nan), np.zeros((0, 2), np.int64))
 

@@ -7,11 +7,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.data.captures.joined import joined
 from nerf_lightning.data.captures.reader import Spaces
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.extensions.many_scenes.brick_models import BrickModelReader
+from nerf_lightning.extensions.many_scenes.joined import joined
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

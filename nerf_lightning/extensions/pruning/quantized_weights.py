@@ -77,11 +77,11 @@ def reached_entries(level: Level) -> Bool[Tensor, "entries"] | None:
     if not (isinstance(sampler, OccupancySampler) and isinstance(field, NGPField)):
         return None
     encoder, grid = field.position_encoder, sampler.grid
-    if not isinstance(encoder, HashGridEncoder) or field.contracted.is_on() or grid.num_cascades > 1:
+    if not isinstance(encoder, HashGridEncoder) or field.contracted.is_on():
         return None
     if not torch.equal(field.aabb, grid.aabb):
         return None
-    return entries_of_cells(encoder.layout, grid.cells[0].bool().cpu())
+    return entries_of_cells(encoder.layout, grid.cells.bool().cpu())
 
 
 def entries_of_cells(layout: HashGridLayout, occupied: Bool[Tensor, "side side side"]) -> Bool[Tensor, "entries"]:

@@ -129,8 +129,8 @@ def _flat_gaussians(
 def towards(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     """Return unit quaternions whose rotations take the z axis to the normals or their opposites; of zeros to itself.
 
-    >>> (10 * towards(torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))).int().tolist()
-    [[7, 0, 7, 0], [10, 0, 0, 0]]
+    >>> towards(torch.tensor([[1.0, 1.0, 0.0]])).tolist()
+    [[0.5773502588272095, -0.5773502588272095, 0.5773502588272095, 0.0]]
     """
     x, y, z = (normals * torch.where(normals[:, 2:] < 0, -1.0, 1.0)).unbind(dim=-1)
     return torch.nn.functional.normalize(torch.stack([1 + z, -y, x, torch.zeros_like(z)], dim=-1), dim=-1)

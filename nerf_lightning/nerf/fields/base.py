@@ -28,9 +28,6 @@ class HiddenLayer:
 class Field(Part, ABC):
     """A radiance field: it answers what is asked of points (`types.points`)."""
 
-    needs_whole_batch: bool = False
-    """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
-
     sees_cones: bool = False
     """True where the result depends on the pixels' cones (`Points.covariance`)."""
 

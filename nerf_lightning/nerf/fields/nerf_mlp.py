@@ -17,8 +17,6 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
-# Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
-MOMENTUM, EPSILON = 0.01, 1e-3
 MOST_LAYERS = 100
 
 
@@ -35,7 +33,6 @@ class NerfMLP(Field):
         density_activation: relu as in the paper, or softplus, which cannot die.
         density_bias: added to the raw density before its activation; negative values start from empty space.
         density_noise: standard deviation of the normal noise added to the raw density while training.
-        batch_norm: normalise each hidden layer over the batch, as the article does; forbids tiles.
         xavier: Glorot uniform weights and zero biases, as Keras has them; False for torch's own start.
         contraction: see all space contracted around the scene's box into a ball of radius 2; None: as the scene's
             space. Otherwise positions enter as they are, as in the paper.
@@ -53,7 +50,6 @@ class NerfMLP(Field):
         density_activation: Literal["relu", "softplus"] = "relu",
         density_bias: float = 0.0,
         density_noise: float = 0.0,
-        batch_norm: bool = False,
         xavier: bool = True,
         contraction: bool | None = None,
     ):
@@ -72,7 +68,6 @@ class NerfMLP(Field):
         self.density_activation = density_activation
         self.density_bias = density_bias
         self.density_noise = density_noise
-        self.needs_whole_batch = batch_norm
         self.xavier = xavier
         self.contracted = Contracted(contraction)
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -80,10 +75,10 @@ class NerfMLP(Field):
         sizes = [inputs] + [width] * (depth - 1)
         if skip is not None:
             sizes[skip] += inputs
-        self.trunk = nn.ModuleList(_hidden(size, width, batch_norm) for size in sizes)
+        self.trunk = nn.ModuleList(_hidden(size, width) for size in sizes)
         self.density_head = nn.Linear(width, 1)
         self.feature = Linear(width, width)
-        self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2, batch_norm)
+        self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2)
         self.color_head = nn.Linear(width // 2, 3)
         self.reset_parameters()
 
@@ -147,17 +142,14 @@ class NerfMLP(Field):
         self.position_encoder.reset_parameters()
         self.direction_encoder.reset_parameters()
         for module in self.modules():
-            if isinstance(module, nn.BatchNorm1d):
-                module.reset_parameters()
-            elif isinstance(module, nn.Linear):
+            if isinstance(module, nn.Linear):
                 module.reset_parameters()
                 if self.xavier:
                     nn.init.xavier_uniform_(module.weight)
                     nn.init.zeros_(module.bias)
 
     def _rows(self, layer: str) -> tuple[str, ...]:
-        norm = ("weight", "bias", "running_mean", "running_var") if self.needs_whole_batch else ()
-        return (f"{layer}.0.weight", f"{layer}.0.bias", *(f"{layer}.1.{name}" for name in norm))
+        return f"{layer}.0.weight", f"{layer}.0.bias"
 
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
@@ -178,19 +170,10 @@ class NerfMLP(Field):
         return functional.relu(raw) if self.density_activation == "relu" else functional.softplus(raw)
 
 
-class _BatchNorm(nn.BatchNorm1d):
-    """Batch normalisation of the last axis, whatever the leading ones."""
-
-    def forward(self, features: Float[Tensor, "*points width"]) -> Float[Tensor, "*points width"]:
-        return super().forward(features.flatten(0, -2)).view_as(features)
-
-
 def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
     # With so few outputs float32 costs nothing, and a density or a colour keeps the digits that it has.
     return linear(features, head.weight, head.bias, "float32")
 
 
-def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:
-    linear: list[nn.Module] = [Linear(inputs, outputs)]
-    norm: list[nn.Module] = [_BatchNorm(outputs, eps=EPSILON, momentum=MOMENTUM)] if batch_norm else []
-    return nn.Sequential(*linear, *norm, nn.ReLU(inplace=True))
+def _hidden(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(Linear(inputs, outputs), nn.ReLU(inplace=True))

@@ -28,8 +28,6 @@ class Model(nn.Module, ABC):
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
-    needs_whole_batch: bool = False
-    """True where the result for one ray depends on the others; such a model is never cut into tiles."""
     needs_photographs: bool = False
     """True where it renders a scene from photographs: `set_source_images` is called before the first rays."""
     baselines: Baselines | None = None

@@ -48,11 +48,6 @@ class RadianceModel(PointField):
         return numbers[0] if len(numbers) > 1 else None
 
     @property
-    def needs_whole_batch(self) -> bool:  # type: ignore[override]
-        """Whether any field forbids tiles."""
-        return any(level.field.needs_whole_batch for level in self._in_order())
-
-    @property
     def has_static_shapes(self) -> bool:  # type: ignore[override]
         """Whether no level's shapes depend on what it finds."""
         return all(level.has_static_shapes for level in self._in_order())

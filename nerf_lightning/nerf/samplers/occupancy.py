@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
-from nerf_lightning.nerf.geometry.contraction import Contracted
+from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
@@ -25,14 +24,10 @@ from nerf_lightning.nerf.types.scene import Scene
 log = logging.getLogger(__name__)
 
 CAPACITY = 1 << 20
-# Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
-CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
 # Devices on which a number may be read on the host between two kernels while rendering.
 HOSTS = ("cpu", "cuda")
 RANGES = {
-    "num_cascades": (1, 32),
     "num_steps": (1, 1 << 20),
-    "cone_angle": (0.0, 1.0),
     "update_every": (1, 1 << 30),
     "warmup_steps": (0, 1 << 40),
     "prune_after": (0, 1 << 40),
@@ -53,11 +48,7 @@ class OccupancySampler(RaggedSampler):
 
     Args:
         resolution: cells along a side of the box; a multiple of 4.
-        num_cascades: boxes, each twice as large as the one before, the first being the scene's. None: 1, and in
-            contracted scenes 6 of half the resolution (in whole blocks of 4 cells).
         num_steps: intervals across the diagonal of the scene's box.
-        cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike. None: 0, and in
-            contracted scenes 1/256.
         update_every: steps between two updates of the grid.
         warmup_steps: until then every cell is asked at each update, later every other one.
         prune_after: steps before which no cell is given up; larger where the background is baked into the pictures,
@@ -72,9 +63,7 @@ class OccupancySampler(RaggedSampler):
     def __init__(
         self,
         resolution: int = 128,
-        num_cascades: int | None = None,
         num_steps: int = 384,
-        cone_angle: float | None = None,
         update_every: int = 16,
         warmup_steps: int = 256,
         prune_after: int = 0,
@@ -87,13 +76,10 @@ class OccupancySampler(RaggedSampler):
         if resolution % BLOCK or resolution < BLOCK:
             raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
         require_ranges(locals(), RANGES)
-        self.wanted = (resolution, num_cascades, cone_angle)
         self.num_steps = num_steps
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
-        self.contracted = Contracted()
-        self.grid = OccupancyGrid()
-        self._fit_to_space()
+        self.grid = OccupancyGrid(resolution)
         # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
@@ -103,19 +89,22 @@ class OccupancySampler(RaggedSampler):
         """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
 
         Raises:
-            InputError: no training ray meets the box, or nothing is left in it.
+            InputError: the scene has no box, no training ray meets it, or nothing is left in it.
         """
-        self.contracted.fit_to(scene)
-        self._fit_to_space()
+        if scene.space == "contracted":
+            raise InputError(
+                f"The photographs of {scene.name} show what lies far behind the content (space=contracted), and an "
+                "occupancy grid needs a box around all that is seen. Use model=fast_proposal (or model=auto), or give "
+                "scene.space=bounded if the content alone is wanted."
+            )
         self.grid.aabb.copy_(scene.aabb)
         self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
-        for cascade in range(self.grid.num_cascades):
-            centers, half_diagonal = self.grid.cell_centers(cascade)
-            # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
-            if scene.space != "ndc":
-                possible = possible_cells(scene, centers, half_diagonal)
-                self.grid.possible[cascade] = possible.view(self.grid.possible.shape[1:])
+        # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
+        if scene.space == "ndc":
+            self.grid.possible.fill_(True)
+        else:
+            self.grid.possible.copy_(possible_cells(scene, *self.grid.cell_centers()).view_as(self.grid.possible))
         if not bool(self.grid.possible.any()):
             lower, upper = ([round(float(x), 3) for x in corner] for corner in scene.aabb)
             raise InputError(
@@ -126,12 +115,6 @@ class OccupancySampler(RaggedSampler):
         self.reset()
         if scene.space == "bounded":
             self._question_cameras_inside(scene)
-        else:
-            log.warning(
-                "The photographs of %s show what lies behind the content, so little of its space is empty: "
-                "model=fast_proposal learns such captures several times faster than an occupancy grid does.",
-                scene.name,
-            )
 
     def _question_cameras_inside(self, scene: Scene) -> None:
         eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3]
@@ -181,9 +164,7 @@ class OccupancySampler(RaggedSampler):
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> MarchState:
         """Return the beginning of a march along rays."""
-        center, half = center_and_half(self.grid.aabb)
-        half = half * 2.0 ** (self.grid.num_cascades - 1)
-        enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
+        enter, leave = distances_in_box(rays, self.grid.aabb)
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
         return MarchState(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 
@@ -197,7 +178,7 @@ class OccupancySampler(RaggedSampler):
 
     @property
     def step_size(self) -> float:
-        """The shortest interval, in scene units."""
+        """An interval, in scene units."""
         return float((self.grid.aabb[1] - self.grid.aabb[0]).norm()) / self.num_steps
 
     @property
@@ -206,11 +187,9 @@ class OccupancySampler(RaggedSampler):
         if self._lattice is None:
             near, far = self.grid.range.tolist()
             edges, step = [near], self.step_size
-            self._require_few((far - near) / step if not self.cone_angle else 0.0)
+            self._require_few((far - near) / step)
             while edges[-1] <= far:
-                edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
-                if len(edges) > self.max_intervals:  # of a narrow cone, whose intervals hardly grow
-                    self._require_few(max((far - near) / step, len(edges)))
+                edges.append(edges[-1] + step)
             edges.append(2 * edges[-1] - edges[-2])
             self._lattice = torch.tensor(edges)
         self._lattice = self._lattice.to(self.grid.aabb.device)
@@ -222,8 +201,7 @@ class OccupancySampler(RaggedSampler):
         It is `lattice` where that reaches; elsewhere it is shifted by whole intervals. On devices that compile for
         fixed shapes (XLA) it is always `lattice`.
         """
-        # Contracted scenes, whose intervals grow with the distance, have one near and far for all cameras.
-        if rays.near.device.type not in HOSTS or self.cone_angle or not rays.near.numel():
+        if rays.near.device.type not in HOSTS or not rays.near.numel():
             return self.lattice
         near, far = self.grid.range.tolist()
         nearest, farthest = float(rays.near.min()), float(rays.far.max())
@@ -267,22 +245,8 @@ class OccupancySampler(RaggedSampler):
             mean = grid.density.sum() / grid.possible.sum()
             grid.occupy((grid.density > (0.5 * mean).clamp(max=self._least_density)) & grid.possible)
 
-    def _fit_to_space(self) -> None:
-        """Make the grid as large as the space wants it; what it held is forgotten."""
-        resolution, cascades, cone_angle = self.wanted
-        if self.contracted.is_on():
-            resolution = max(BLOCK, resolution // 2 // BLOCK * BLOCK) if cascades is None else resolution
-            cascades = CASCADES_ENDLESS if cascades is None else cascades
-            cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
-        self.cone_angle = cone_angle or 0.0
-        self.grid.allocate(resolution, cascades or 1)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # The grid must be as large as the one that is read. A missing switch is complained of below.
-        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", self.contracted.switch))
-        self.contracted.forget()
-        self._fit_to_space()
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
         self._lattice = self._numbers = None
 
 

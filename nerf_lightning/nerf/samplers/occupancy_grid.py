@@ -16,10 +16,10 @@ CELLS_AT_ONCE = 1 << 18
 
 
 class OccupancyGrid(nn.Module):
-    """Cells in nested boxes, each box twice as large as the one before; cells are numbered box by box, z fastest."""
+    """Cells in a box, numbered z fastest."""
 
     aabb: Tensor
-    """Lower and upper corner of the first box."""
+    """Lower and upper corner of the box."""
     range: Tensor
     """Near and far of the scene."""
     density: Tensor
@@ -33,21 +33,17 @@ class OccupancyGrid(nn.Module):
     leaps: Tensor | None
     """How far the next such block is; None until it is asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self, resolution: int) -> None:
         super().__init__()
+        self.resolution = resolution
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.register_buffer("range", torch.tensor([0.0, 1.0]))
 
-    def allocate(self, resolution: int, num_cascades: int) -> None:
-        """Make the grid so many cells wide and so many boxes deep; what it held is forgotten."""
-        self.resolution, self.num_cascades = resolution, num_cascades
-        side = (num_cascades, resolution, resolution, resolution)
-        blocks = (num_cascades, *(resolution // BLOCK,) * 3)
-        device = self.aabb.device
-        self.register_buffer("density", torch.zeros(side, device=device))
-        self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
-        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
-        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+        side, blocks = (resolution,) * 3, (resolution // BLOCK,) * 3
+        self.register_buffer("density", torch.zeros(side))
+        self.register_buffer("possible", torch.ones(side, dtype=torch.bool))
+        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
+        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
         self.register_buffer("leaps", None, persistent=False)
 
     def validate_state(self) -> None:
@@ -101,18 +97,17 @@ class OccupancyGrid(nn.Module):
     def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
         """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""
         side = self.resolution
-        cascade, rest = number // side**3, number % side**3
-        cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
-        return self._from_cells(cell + within, (2.0**cascade)[:, None])
+        cell = torch.stack([number // side**2, number // side % side, number % side], dim=-1)
+        return self._from_cells(cell + within)
 
-    def cell_centers(self, cascade: int) -> tuple[Float[Tensor, "cells 3"], float]:
-        """Return the centres of the cells of one box, and half the diagonal of a cell."""
+    def cell_centers(self) -> tuple[Float[Tensor, "cells 3"], float]:
+        """Return the centres of the cells, and half the diagonal of a cell."""
         along = torch.arange(self.resolution, device=self.aabb.device)[:, None] + 0.5
-        axes = self._from_cells(along, 2.0**cascade).unbind(dim=-1)
-        half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) * 2**cascade / self.resolution
+        axes = self._from_cells(along).unbind(dim=-1)
+        half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) / self.resolution
         return torch.stack(torch.meshgrid(*axes, indexing="ij")).view(3, -1).t(), half_diagonal
 
-    def _from_cells(self, at: Tensor, scale: Tensor | float) -> Tensor:
-        """Return places that are given in cells from the lower corner of a box, `scale` times as large as the first."""
+    def _from_cells(self, at: Tensor) -> Tensor:
+        """Return places that are given in cells from the lower corner of the box."""
         center, half = center_and_half(self.aabb)
-        return center + (2.0 * at / self.resolution - 1.0) * half * scale
+        return center + (2.0 * at / self.resolution - 1.0) * half

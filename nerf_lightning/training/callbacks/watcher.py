@@ -18,7 +18,7 @@ from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 
 
 class Watcher(Callback):
-    """Look when it is time; `nerf bench` measures what that costs.
+    """Look when it is time.
 
     Nothing that training reads may be changed.
 

@@ -19,44 +19,11 @@ from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, Simpl
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from nerf_lightning.config.instantiate import require_fitting
+from nerf_lightning.config.lightning_arguments import OWNED
 from nerf_lightning.messages.errors import InputError
 
 DEFAULTS: dict[str, Any] = {"num_sanity_val_steps": 0, "enable_model_summary": False, "log_every_n_steps": 1}
 """Ours, where they differ from Lightning's."""
-OWNED = {
-    "accelerator": "trainer.accelerator",
-    "accumulate_grad_batches": "data.batch_rays",
-    "barebones": "nerf bench",
-    "callbacks": "callbacks (+callbacks.NAME._target_=my_package.MyCallback)",
-    "check_val_every_n_epoch": "trainer.val_every_steps",
-    "default_root_dir": "paths.output_dir",
-    "deterministic": "trainer.deterministic",
-    "devices": "trainer.devices",
-    "enable_checkpointing": "callbacks.checkpoints",
-    "enable_progress_bar": "callbacks.progress_bar (~callbacks.progress_bar)",
-    "gradient_clip_algorithm": "trainer.clip_norm",
-    "gradient_clip_val": "trainer.clip_norm",
-    "limit_predict_batches": "path.num_frames",
-    "limit_test_batches": "evaluation.max_views",
-    "limit_train_batches": "trainer.max_steps",
-    "logger": "logger",
-    "max_epochs": "trainer.max_epochs",
-    "max_steps": "trainer.max_steps",
-    "max_time": "budget.seconds",
-    "min_epochs": "trainer.max_epochs",
-    "min_steps": "trainer.max_steps",
-    "model_registry": "callbacks.checkpoints",
-    "num_nodes": "trainer.launched_by",
-    "overfit_batches": "scene.frames, which keeps some views",
-    "plugins": "trainer.launched_by",
-    "precision": "trainer.precision",
-    "reload_dataloaders_every_n_epochs": "data",
-    "strategy": "trainer.devices",
-    "sync_batchnorm": "field.batch_norm",
-    "use_distributed_sampler": "trainer.devices",
-    "val_check_interval": "trainer.val_every_steps",
-}
-"""What each is with us."""
 REFUSALS = (MisconfigurationException, ValueError, TypeError, ImportError)
 """What Lightning raises for an argument that it does not take."""
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}

@@ -34,16 +34,13 @@ class KeyframeCurve:
         self._keys = keyframe_poses(keyframes, around).double()
         even = even_speed(self._keys, around.radius, closed)
         self.knots = torch.tensor(times, dtype=self._keys.dtype) if times else even
-        targets = [around.point("file", each.look_at) for each in keyframes if each.look_at is not None]
-        self._targets = torch.stack(targets).double() if len(targets) == len(keyframes) else None
+        self._targets = torch.stack([around.point("file", each.look_at) for each in keyframes]).double()
         logs = [[math.log(keyframe_focal(each, around))] for each in keyframes]
         self._log_focal = torch.tensor(logs, dtype=self.knots.dtype)
 
     def poses(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames 3 4"]:
         """Return the cameras to world at some times."""
         c2w = poses_along(self.knots, self._keys, at)
-        if self._targets is None:
-            return c2w
         eyes = c2w[:, :, 3]
         back = normalize(eyes - along(self.knots, self._targets, at), dim=-1)
         right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
@@ -77,6 +74,4 @@ def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Te
 
 def keyframe_focal(keyframe: Keyframe, around: PathFrame) -> float:
     """Return a keyframe's focal length in pixels of a picture as wide as the photographs."""
-    if keyframe.fov is not None:
-        return focal_from_fov(around.width, math.radians(keyframe.fov))
-    return around.focal if keyframe.focal is None else keyframe.focal
+    return around.focal if keyframe.fov is None else focal_from_fov(around.width, math.radians(keyframe.fov))

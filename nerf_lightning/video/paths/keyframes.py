@@ -1,13 +1,13 @@
 """Keyframe files: cameras that a person has chosen, as yaml that can be written by hand, read and written here.
 
-    keyframes:
-    - position: [4.0, 0.0, 2.0]   # in the frame and the units of the capture's own files
-      look_at: [0.0, 0.0, 0.5]    # a point; or direction: [-4.0, 0.0, -1.5], of any length
-      up: [0.0, 0.0, 1.0]         # where the picture's top points; left out: the capture's up
-      fov: 40.0                   # degrees across the width, or focal: pixels; left out: as the photographs
-      time: 0.0                   # seconds; in all keyframes or in none (none: at about one speed)
+keyframes:
+- position: [4.0, 0.0, 2.0]   # in the frame and the units of the capture's own files
+  look_at: [0.0, 0.0, 0.5]    # a point
+  up: [0.0, 0.0, 1.0]         # where the picture's top points; left out: the capture's up
+  fov: 40.0                   # degrees across the width; left out: as the photographs
+  time: 0.0                   # seconds; in all keyframes or in none (none: at about one speed)
 
-`focal` is that of a picture as wide as the photographs, so that it does not depend on the size of the film.
+A file has two keyframes or more.
 """
 
 from collections.abc import Sequence
@@ -25,29 +25,24 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.paths.base import is_number, is_point
 
 Point = tuple[float, float, float]
-POINTS = ("position", "look_at", "direction", "up")
-NUMBERS = ("fov", "focal", "time")
+POINTS = ("position", "look_at", "up")
+NUMBERS = ("fov", "time")
 CURE = "Check path.file; a keyframe file is a plain list of cameras, without references."
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One chosen camera, as the file has it (above). One of `look_at` and `direction` is there."""
+    """One chosen camera, as the file has it (above)."""
 
     position: Point
-    look_at: Point | None = None
-    direction: Point | None = None
+    look_at: Point
     up: Point | None = None
     fov: float | None = None
-    focal: float | None = None
     time: float | None = None
 
     @property
     def ahead(self) -> Point:
         """Where it looks, of any length."""
-        if self.direction is not None:
-            return self.direction
-        assert self.look_at is not None
         x, y, z = (to - at for to, at in zip(self.look_at, self.position, strict=True))
         return x, y, z
 
@@ -82,7 +77,7 @@ def _keyframes(content: Any, path: Path) -> list[Keyframe]:
     if not isinstance(found, list):
         raise InputError(
             f"{path} has no list of keyframes. Write `keyframes:` and under it one `- position: [x, y, z]` "
-            "with a look_at or direction for each camera."
+            "with a look_at for each camera."
         )
     return [_keyframe(each, f"{path}, keyframe {number}") for number, each in enumerate(found, start=1)]
 
@@ -90,7 +85,7 @@ def _keyframes(content: Any, path: Path) -> list[Keyframe]:
 def _keyframe(content: Any, where: str) -> Keyframe:
     known = (*POINTS, *NUMBERS)
     if not isinstance(content, dict) or not content:
-        raise InputError(f"{where} is {brief(content)}, but must name a position and a look_at or direction.")
+        raise InputError(f"{where} is {brief(content)}, but must name a position and a look_at.")
     unknown = [key for key in content if key not in known]
     if unknown:
         raise InputError(f"{where} has the unknown key {brief(unknown[0])}. It may have {', '.join(known)}.")
@@ -99,17 +94,15 @@ def _keyframe(content: Any, where: str) -> Keyframe:
             raise InputError(f"{where}: {key} is {brief(value)}, but must be three finite numbers, [x, y, z].")
         if key in NUMBERS and not is_number(value):
             raise InputError(f"{where}: {key} is {brief(value)}, but must be a finite number.")
-    if "position" not in content or ("look_at" in content) == ("direction" in content):
-        raise InputError(f"{where} must have a position, and one of look_at and direction.")
-    if "fov" in content and "focal" in content:
-        raise InputError(f"{where} has both fov and focal. Keep one of them.")
-    if not 0 < content.get("fov", 90) < 180 or content.get("focal", 1) <= 0:
-        raise InputError(f"{where}: fov must be between 0 and 180 degrees, and focal positive.")
+    if "position" not in content or "look_at" not in content:
+        raise InputError(f"{where} must have a position and a look_at.")
+    if not 0 < content.get("fov", 90) < 180:
+        raise InputError(f"{where}: fov must be between 0 and 180 degrees.")
     values: dict[str, Any] = {key: tuple(map(float, content[key])) for key in POINTS if key in content}
     values |= {key: float(content[key]) for key in NUMBERS if key in content}
     found = Keyframe(**values)
     if found.ahead == (0, 0, 0) or found.up == (0, 0, 0):
-        raise InputError(f"{where} looks nowhere: its direction or up has no length, or look_at is its position.")
+        raise InputError(f"{where} looks nowhere: its up has no length, or look_at is its position.")
     return found
 
 

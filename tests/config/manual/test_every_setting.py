@@ -39,25 +39,25 @@ def test_every_key_of_the_composed_config_is_known_with_its_default(command):
     for key, value in values.items():
         if key in known and isinstance(value, int | float) and not isinstance(value, bool):
             assert float(command.default(key)) == value, key
-        elif key in known and isinstance(value, str) and value and "$" not in value:
+        elif key in known and isinstance(value, str) and value not in ("", "???") and "$" not in value:
             assert command.default(key) == value, key
 
 
 @pytest.mark.parametrize("group", groups())
 def test_every_option_has_a_line_of_its_own(group):
     named = [each for command in COMMANDS.values() for each in command.options.items() if each[0] == group]
-    lines = [brief(option.about[0]) for _, options in named[:1] for option in options]
+    lines = [brief(option.about) for _, options in named[:1] for option in options]
     assert len(lines) == len(set(lines)), lines
     assert all(len(line) > 8 for line in lines), lines
 
 
 @every_command
 def test_the_short_help_lists_its_groups_and_fits_its_width(command):
-    page = command_page(command, 120)
+    page = command_page(command, 80)
     assert "$" not in page
     assert "Examples:" in page
-    assert len(page.splitlines()) < 120
-    assert [line for line in page.splitlines() if len(line) > 120] == []
+    assert len(page.splitlines()) < 170
+    assert [line for line in page.splitlines() if len(line) > 80] == []
     lines = page.partition("Groups and their options:\n")[2].partition("\n\n")[0].splitlines()
     listed = {line.split()[0] for line in lines if line[2:3].strip()}
     assert listed == {group for group in command.groups if len(option_names(group)) > 1}

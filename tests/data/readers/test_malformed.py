@@ -91,7 +91,7 @@ TRANSFORMS = {
     "a path of Windows": (frame(2, file_path="C:\\Users\\a.jpg"), r"\[2\]: file_path is C:.*an absolute path of"),
     "an absolute path": (frame(2, file_path="/home/a.jpg"), r"\[2\]: file_path is /home/a.jpg, an absolute path"),
     "an absent image": (frame(2, file_path="images/no.png"), r"\[2\]: the image \S+images/no.png does not exist"),
-    "a long name": (frame(2, file_path="images/" + "x" * 5000), r"frames\[2\]: the image .* does not exist"),
+    "a long name": (frame(2, file_path="images/" + "x" * 5000), r"frames\[2\].* more than 1024 characters"),
     "an image by number": (frame(2, file_path=7), r"frames\[2\]: file_path is 7, but it must be a path as text"),
     "a pose without its last row": (frame(2, transform_matrix=ROWS), r"frames\[2\].* does not end in the row 0 0 0 1"),
     "a pose of words": (frame(2, transform_matrix=[["a"] * 4] * 4), r"is not a 4 x 4 matrix of numbers"),
@@ -155,14 +155,14 @@ def first_alone(root):
 
 EVERY = slice(None)
 NPY = "poses_bounds.npy"
-NO_ARRAY = r"poses_bounds.npy is not an array of numbers as numpy saves it"
+NO_ARRAY = r"poses_bounds.npy cannot be read \(ValueError"
 LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
     "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
     "empty": (text(NPY, lambda old: b""), NO_ARRAY),
     "an archive": (archived, NO_ARRAY),
-    "pickled": (pickled, r"poses_bounds.npy is not an array of numbers .*Object arrays cannot be loaded"),
+    "pickled": (pickled, r"poses_bounds.npy cannot be read \(ValueError: Object arrays cannot be loaded"),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
     "a photograph missing": (lambda root: one_picture(root).unlink(), r"has 9 poses, but \S+images has 8 photographs"),
     "a photograph too many": (
@@ -216,10 +216,6 @@ def exchanged(root):
     b.write_bytes(old)
 
 
-def twin(**changed):
-    return lambda root: write_colmap(root, Known(**changed), ".txt")
-
-
 def point(x):
     record = struct.pack("<Q3d3BdQ", 1, x, 0, 0, 1, 1, 1, 0.1, 0)
     return lambda root: (root / MODEL / "points3D.bin").write_bytes(struct.pack("<Q", 1) + record)
@@ -232,20 +228,31 @@ def swap(old, new):
 IMAGES = MODEL / "images.bin"
 FEATURES = struct.pack("<QI7dI", 1, 1, 1, *[0] * 6, 1) + b"a.png\0" + struct.pack("<Q", (1 << 64) - 1) + bytes(100)
 PINHOLE = (20.0, 20.0, 8.0, 6.0)
-DISAGREE = r"sparse/0 holds the model twice, and its binary and its text files disagree. Remove .* older"
 FAR_POINT = r"sparse/0: 1 of (1|60) sparse points are NaN or beyond 1e\+09, and are left out"
 COLMAP = {
     "no model": (lambda root: (root / "sparse").rename(root / ".sparse"), r"holds no COLMAP model: .* sparse, "),
-    "half a model": (lambda root: (root / IMAGES).unlink(), r"holds cameras.bin but no images.bin: it is not whole"),
+    "half a model": (
+        lambda root: (root / IMAGES).unlink(),
+        r"images.bin cannot be read \(FileNotFoundError",
+    ),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
     "an empty model": (emptied, r"has no registered photograph, so nothing can be learnt. Copy the model again, or"),
-    "a tail": (text(IMAGES, lambda old: old + b"tail"), r"images.bin goes on for 4 bytes after what it announces"),
-    "files exchanged": (exchanged, r"(cameras|images).bin (ends after|goes on|holds)"),
-    "more announced": (text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]), r"images.bin ends after \d+"),
-    "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin ends after \d+ bytes"),
-    "a name that is no text": (swap(b"p_0.png", b"\xffp_0.png"), r"a file name that is not UTF-8: b'\\xffp_0.png'"),
+    "a tail": (
+        text(IMAGES, lambda old: old + b"tail"),
+        r"images.bin cannot be read \(ValueError: it announces \S+ bytes, and has",
+    ),
+    "files exchanged": (exchanged, r"(cameras|images).bin (cannot be read|holds)"),
+    "more announced": (
+        text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]),
+        r"images.bin .*announces \S+ entries",
+    ),
+    "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin .*announces \S+ bytes"),
+    "a name that is no text": (
+        swap(b"p_0.png", b"\xffp_0.png"),
+        r"images.bin cannot be read \(UnicodeDecodeError: 'utf-8",
+    ),
     "a photograph twice": (swap(b"p_0.png", b"p_1.png"), r"lists p_1.png more than once, with different"),
     "a photograph without a name": (swap(b"p_0.png", b""), r"lacks the photograph  of"),
     "a camera twice": (cameras(1, *PINHOLE, views=(7, 7)), r"cameras.bin holds 7 more than once"),
@@ -255,9 +262,6 @@ COLMAP = {
     ),
     "a point with NaN": (point(np.nan), FAR_POINT),
     "a point beyond float32": (point(1e300), FAR_POINT),
-    "a twin of other poses": (twin(c2w=ring(9, height=2.0)), DISAGREE),
-    "a twin of other cameras": (twin(focal=(21.0, 20.0)), DISAGREE),
-    "a twin of other photographs": (twin(names=tuple(f"q_{view}.png" for view in range(9))), DISAGREE),
     "no rotation": (text(IMAGES, lambda old: old[:12] + bytes(32) + old[44:]), r"p_0.png has a pose or intrinsics"),
     "fx of zero": (cameras(1, 0.0, 20.0, 8.0, 6.0), r"sparse/0: the view p_0.png has the focal length 0, 20"),
     "another size": (cameras(1, 20.0, 20.0, 800.0, 600.0), r"principal point at 800, 600, outside of its 16 x 12"),
@@ -279,16 +283,28 @@ def without_features(old):
 
 TEXT = {
     "an unknown camera": (lines("cameras.txt", lambda old: old.replace("PINHOLE", "P")), r"line 2 holds .*unknown"),
-    "few parameters": (lines("cameras.txt", lambda old: old.replace(" 6.0\n", "\n")), r"cameras.txt, line 2 should"),
-    "no width": (lines("cameras.txt", lambda old: old.replace("E 16", "E nan")), r"a whole number where nan stands"),
-    "words": (lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)), r"images.txt, line 3 should hold 8"),
-    "no features": (lines("images.txt", without_features), r"line 3: the line after it must hold the photograph's"),
-    "cut short": (lines("images.txt", lambda old: old[: old.index(" p_8.png")]), r"line 19 lacks the photograph's"),
+    "few parameters": (
+        lines("cameras.txt", lambda old: old.replace(" 6.0\n", "\n")),
+        r"cameras.txt, line 2 .*PINHOLE has 4 parameters, not 3",
+    ),
+    "no width": (
+        lines("cameras.txt", lambda old: old.replace("E 16", "E nan")),
+        r"cameras.txt, line 2 .*float NaN to integer",
+    ),
+    "words": (
+        lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)),
+        r"images.txt, line 3 .*to float: 'one'",
+    ),
+    "no features": (lines("images.txt", without_features), r"line 3 .*the next line must hold features"),
+    "cut short": (lines("images.txt", lambda old: old[: old.index(" p_8.png")]), r"line 19 .*expected 7, got 6"),
     "points cut short": (
         lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]),
-        r"line 60 should hold 3 numbers",
+        r"line 60 .*expected 3, got",
     ),
-    "binary": (text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"), r"images.txt is not a text file \(it is not"),
+    "binary": (
+        text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"),
+        r"images.txt cannot be read \(UnicodeDecodeError",
+    ),
     "a point far away": (
         lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)),
         FAR_POINT,
@@ -450,7 +466,7 @@ def test_a_binary_cut_or_changed_anywhere_is_refused_or_read(tmp_path, name):
     content = path.read_bytes()
     for size in sorted({0, 1, 7, 8, 9, *range(10, len(content), 37), len(content) - 1}):
         path.write_bytes(content[:size])
-        refused("colmap", root, rf"{name}.bin ends after {size} bytes, in the middle of what it announces")
+        refused("colmap", root, rf"{name}.bin cannot be read \(.* Copy the model again, or run")
     rng = np.random.default_rng(4)
     for place in range(0, min(len(content), 200), 5):
         damaged = bytearray(content)

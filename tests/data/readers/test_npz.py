@@ -111,7 +111,7 @@ ONE_NAN[2, 0, 0, 0] = np.nan
         ({"focal": np.array([1.0, 2.0])}, r"focal must be one number of pixels"),
         ({"focal": np.array(-1.0)}, r"the view 0 has the focal length -1"),
         ({"focal": np.array("far")}, r"focal must be one number of pixels"),
-        ({"focal": np.array({"a": 1})}, r"is not a numpy .npz archive, or is damaged: Object arrays"),
+        ({"focal": np.array({"a": 1})}, r"npz cannot be read \(ValueError: Object arrays"),
     ],
 )
 def test_refuses_content(path, changed, message):
@@ -121,11 +121,11 @@ def test_refuses_content(path, changed, message):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda content: b"", r"a.npz is not a numpy .npz archive, or is damaged: .*Remove it, and copy"),
-        (lambda content: b"not an archive", r"a.npz is not a numpy .npz archive, or is damaged"),
-        (lambda content: b"PK\x03\x04 cut short", r"a.npz is not a numpy .npz archive, or is damaged"),
-        (lambda content: content[:2000], r"a.npz is not a numpy .npz archive, or is damaged"),
-        (lambda content: npy(np.zeros(3)), r"is not a numpy .npz archive: it holds a single array. It needs images"),
+        (lambda content: b"", r"a.npz cannot be read \(BadZipFile: .*Remove it, and copy"),
+        (lambda content: b"not an archive", r"a.npz cannot be read \(BadZipFile"),
+        (lambda content: b"PK\x03\x04 cut short", r"a.npz cannot be read \(BadZipFile"),
+        (lambda content: content[:2000], r"a.npz cannot be read \(BadZipFile"),
+        (lambda content: npy(np.zeros(3)), r"a.npz cannot be read .* It needs images"),
     ],
 )
 def test_refuses_files_that_are_no_npz(tmp_path, damage, message):

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -304,10 +305,12 @@ def test_where_a_model_may_lie(tmp_path, where):
     assert_true(read("colmap", write_colmap(tmp_path / "c", known, where=where)), known)
 
 
-def test_binary_and_text_that_agree_are_fine(tmp_path):
+def test_of_a_model_in_binary_and_in_text_the_binary_is_read(tmp_path, caplog):
     known = Known()
-    write_colmap(tmp_path / "c", known, ".bin")
-    assert_true(read("colmap", write_colmap(tmp_path / "c", known, ".txt")), known)
+    write_colmap(tmp_path / "c", replace(known, focal=(21.0, 20.0)), ".txt")
+    with caplog.at_level("INFO"):
+        assert_true(read("colmap", write_colmap(tmp_path / "c", known, ".bin")), known)
+    assert "in binary and in text: the binary one is read" in caplog.text
 
 
 def test_blank_lines_of_a_text_model_and_photographs_without_features(tmp_path):

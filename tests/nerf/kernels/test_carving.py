@@ -20,7 +20,7 @@ from nerf_lightning.nerf.samplers.space_carving import possible_cells
 def cells(scene, resolution=24):
     sampler = OccupancySampler(resolution=resolution)
     sampler.grid.aabb.copy_(scene.aabb)
-    return sampler.grid.cell_centers(0)
+    return sampler.grid.cell_centers()
 
 
 @pytest.mark.parametrize(("model", "lens"), [("pinhole", (0.0,) * 6), *LENSES])

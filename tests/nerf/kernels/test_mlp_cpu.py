@@ -6,11 +6,13 @@ import sys
 from itertools import pairwise
 
 import llvmlite.binding as llvm
+import numpy as np
 import pytest
 import torch
 from support.comparing import far_apart
 
 from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.mlp import amx
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS, cpu_multiplies_bfloat16
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS as TILE
@@ -27,9 +29,14 @@ def kernels():
     return backends.backend("nerf_lightning.nerf.kernels.mlp.cpu")
 
 
-@pytest.fixture(params=["float32", pytest.param("bfloat16", marks=needs_bfloat16)])
-def dtype(request):
-    return getattr(torch, request.param)
+@pytest.fixture(params=["float32", pytest.param("bfloat16", marks=needs_bfloat16), "bfloat16 by tiles"])
+def dtype(request, kernels, monkeypatch):
+    name, *tiled = request.param.split(" by ")
+    if tiled and kernels.KINDS[torch.bfloat16] != amx.KIND:
+        pytest.skip("this CPU has no AMX, or this process may not use it")
+    if name == "bfloat16":
+        monkeypatch.setitem(kernels.KINDS, torch.bfloat16, amx.KIND if tiled else np.int32(0))
+    return getattr(torch, name)
 
 
 def given(sizes, rows, dtype):

@@ -85,6 +85,19 @@ def test_few_rays_and_odd_numbers_of_samples(rays, samples):
     compare(a_level(samples=samples, contraction=True), some_rays(rays), 1e-4, batch_random(1, rays), None)
 
 
+@pytest.mark.parametrize("count", [1, 63, 65, 300])
+@pytest.mark.parametrize("closed", [False, True])
+def test_pictures_whose_rays_go_in_groups_show_the_same(count, closed):
+    level, rays = a_level(samples=7, contraction=True), some_rays(count)
+    background = None if closed else torch.rand(count, 3)
+    learnt = level(rays, background, [], None)
+    with torch.no_grad():
+        shown = level(rays, background, [], None)
+    assert learnt.rgb.requires_grad
+    assert torch.equal(shown.weights, learnt.weights)
+    assert torch.equal(shown.rgb, learnt.rgb)
+
+
 def test_codes_of_photographs_learn_and_without_a_photograph_their_mean_is_seen():
     level = a_level(appearance=3)
     level.field.codes = torch.nn.Parameter(torch.randn(5, 3))

@@ -48,9 +48,6 @@ MODELS = {
         "fine": DenseLevel(ImportanceSampler(12), field()),
     },
     "occupancy": lambda field: {"fine": RaggedLevel(OccupancySampler(resolution=16, num_steps=48), field())},
-    "cascades": lambda field: {
-        "fine": RaggedLevel(OccupancySampler(resolution=8, num_cascades=3, num_steps=32, cone_angle=0.01), field())
-    },
     "proposal": lambda field: {
         "proposal": ProposalLevel(StratifiedSampler(24), field()),
         "fine": DenseLevel(ProposalSampler(16), field()),

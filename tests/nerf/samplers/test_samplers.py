@@ -10,7 +10,6 @@ from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.geometry.contraction import normalized_distance as normalized
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
@@ -197,7 +196,7 @@ def learn(sampler, density_fn, steps=320):
 
 def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
     sampler = learn(a_sampler(), ball_density())
-    centers, _ = sampler.grid.cell_centers(0)
+    centers, _ = sampler.grid.cell_centers()
     occupied = sampler.grid.cells.flatten().bool()
     cell = 2.0 / 16
     assert bool(occupied[centers.norm(dim=-1) < 0.5 - cell].all())
@@ -259,34 +258,9 @@ def test_a_box_that_no_camera_sees_and_cameras_inside_of_it_are_said_by_name(cap
     assert caplog.text == ""
 
 
-def contracted_ball():
-    scene = opaque_ball()
-    far = torch.full_like(scene.far, 16.0)
-    return replace(scene, space="contracted", aabb=scene.aabb * 3**-0.5, near=0.003 * far, far=far)
-
-
-def sizes(sampler):
-    return {name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "possible", "cells", "blocks")}
-
-
-@pytest.mark.parametrize(
-    ("settings", "cascades", "side", "cone_angle"),
-    [
-        ({}, 6, 8, 1 / 256),
-        ({"num_cascades": 2}, 2, 16, 1 / 256),
-        ({"cone_angle": 0.0}, 6, 8, 0.0),
-        ({"resolution": 20}, 6, 8, 1 / 256),
-    ],
-)
-def test_contracted_space_wants_more_and_coarser_boxes_unless_told(settings, cascades, side, cone_angle):
-    sampler = a_sampler(contracted_ball(), **settings)
-    grid = (cascades, side, side, side)
-    assert sizes(sampler) == dict.fromkeys(("density", "possible", "cells"), grid) | {
-        "blocks": (cascades, side // 4, side // 4, side // 4)
-    }
-    assert sampler.cone_angle == cone_angle
-    steps = sampler.lattice.diff()
-    assert (float(steps[-1]) > 1.5 * float(steps[0])) == (cone_angle > 0)
+def test_a_scene_without_a_box_is_refused_with_the_model_for_it():
+    with pytest.raises(InputError, match=r"photographs of ball show .* Use model=fast_proposal \(or model=auto\)"):
+        a_sampler(replace(opaque_ball(), space="contracted"))
 
 
 def test_in_normalised_device_coordinates_every_cell_is_possible():
@@ -296,53 +270,10 @@ def test_in_normalised_device_coordinates_every_cell_is_possible():
     assert bool(sampler.grid.possible.all())
 
 
-@pytest.mark.parametrize("placed", [None, opaque_ball(), contracted_ball()], ids=["new", "bounded", "contracted"])
-@pytest.mark.parametrize("saved", [opaque_ball(), contracted_ball()], ids=["from_bounded", "from_contracted"])
-def test_the_grid_takes_the_size_of_the_state_that_is_read(saved, placed):
-    one = learn(a_sampler(saved), ball_density())
-    other = OccupancySampler(resolution=16, num_steps=64)
-    if placed is not None:
-        other.fit_to(placed)
-    other.load_state_dict(one.state_dict())
-    assert sizes(other) == sizes(one)
-    assert (other.grid.num_cascades, other.cone_angle) == (one.grid.num_cascades, one.cone_angle)
-    assert torch.equal(other.grid.cells, one.grid.cells)
-    assert torch.equal(other.lattice, one.lattice)
-    rays = some_rays(20)
-    found, expected = (each(rays, None) for each in (other, one))
-    assert torch.equal(found.starts, expected.starts)
-    learn(other, ball_density())
-
-
-def test_cascades_cover_what_lies_far_out():
-    sampler = a_sampler(contracted_ball())
-    rays = some_rays(40)
-    rays = replace(rays, near=torch.full((40,), 0.05), far=torch.full((40,), 16.0))
-    samples = sampler(rays, None)
-    assert float(samples.ends.max()) > 14.0
-    assert float(ragged_points(rays, samples, None).positions.abs().max()) > 8.0
-    # Intervals grow with the distance.
-    far, near = samples.starts > 10.0, samples.starts < 2.0
-    assert float(samples.deltas[far].mean()) > 1.4 * float(samples.deltas[near].min())
-
-
-def test_a_learnt_shell_beyond_the_first_box_is_kept_and_the_rest_given_up():
-    sampler = a_sampler(contracted_ball())
-    learn(sampler, lambda positions: 50.0 * ((positions.norm(dim=-1) - 5.0).abs() < 1.0).float())
-    cascade, x, y, z = sampler.grid.cells.nonzero().unbind(dim=-1)
-    side, half = sampler.grid.resolution, 3**-0.5 * 2.0**cascade
-    center = (2 * (torch.stack([x, y, z], dim=-1) + 0.5) / side - 1) * half[:, None]
-    reach = 3**0.5 * half / side
-    assert bool(((center.norm(dim=-1) - 5.0).abs() <= 1.0 + reach).all())
-    assert {4, 5} <= set(cascade.tolist())
-
-
 def test_the_centre_of_a_cell_is_the_middle_of_its_positions():
     """Bit for bit: carving asks about the centres, training about points in the same cells."""
-    sampler = OccupancySampler(resolution=12, num_cascades=3)
+    sampler = OccupancySampler(resolution=12)
     sampler.grid.aabb.copy_(torch.tensor([[-1.1, -0.7, -0.3], [0.9, 1.7, 1.1]]))
-    for cascade in range(3):
-        number = torch.arange(12**3) + cascade * 12**3
-        centers, half_diagonal = sampler.grid.cell_centers(cascade)
-        assert torch.equal(centers, sampler.grid.positions(number, torch.full((1, 3), 0.5)))
-        assert half_diagonal == pytest.approx(2**cascade * math.hypot(2.0, 2.4, 1.4) / 24)
+    centers, half_diagonal = sampler.grid.cell_centers()
+    assert torch.equal(centers, sampler.grid.positions(torch.arange(12**3), torch.full((1, 3), 0.5)))
+    assert half_diagonal == pytest.approx(math.hypot(2.0, 2.4, 1.4) / 24)

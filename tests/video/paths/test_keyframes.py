@@ -20,13 +20,13 @@ from nerf_lightning.video.paths.spline import hermite, rotations_along
 def test_what_is_written_is_read_back_and_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
     keyframes = [
         Keyframe((1.0, 2.0, 3.0), look_at=(0.0, 0.0, 0.5), up=(0.0, 1.0, 0.0), fov=40.0, time=0.0),
-        Keyframe((1e-7, 2.0, 3.25), direction=(0.0, -1.0, 0.0), focal=123.5, time=1.5),
+        Keyframe((1e-7, 2.0, 3.25), look_at=(0.0, -1.0, 0.0), time=1.5),
     ]
     write_keyframes(tmp_path / "keys.yaml", keyframes)
     assert read_keyframes(tmp_path / "keys.yaml") == keyframes
     assert [file.name for file in tmp_path.iterdir()] == ["keys.yaml"]
     (tmp_path / "keys.yaml").write_text(
-        "- {position: [1, 0, 0], look_at: [0, 0, 0]}\n- {position: [0, 1, 0], direction: [0, -1, 0]}"
+        "- {position: [1, 0, 0], look_at: [0, 0, 0]}\n- {position: [0, 1, 0], look_at: [0, 0, 0]}"
     )
     first, second = read_keyframes(tmp_path / "keys.yaml")
     assert (first.position, first.ahead, second.ahead) == ((1, 0, 0), (-1, 0, 0), (0, -1, 0))
@@ -47,10 +47,9 @@ MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n
         (f"- {GOOD}\n- 7", "keyframe 2 is 7, but must name a position"),
         (f"- {GOOD}\n- {{position: [1, 0, .nan]}}", "keyframe 2: position is .1, 0, nan., but must be three finite"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], target: [0, 0, 0]}}", "keyframe 2 has the unknown key 'target'"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0]}}", "keyframe 2 must have a position, and one of look_at and direction"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0]}}", "keyframe 2 must have a position and a look_at"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [1, 0, 0]}}", "keyframe 2 looks nowhere"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 18, focal: 9}}", "both fov and focal"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
         (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a value that cannot be read"),
@@ -71,7 +70,7 @@ def test_a_bad_file_is_named(tmp_path, text, words):
 def test_what_cannot_be_filmed_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none.yaml cannot be read: No such file.*path.file"):
         KeyframePath(str(tmp_path / "none.yaml"))
-    file = keyframe_file(tmp_path, *(Keyframe((x, 0.0, 5.0), direction=(0.0, 0.0, -1.0)) for x in (0.0, 1.0)))
+    file = keyframe_file(tmp_path, *(Keyframe((x, 0.0, 5.0), look_at=(x, 0.0, 4.0)) for x in (0.0, 1.0)))
     with pytest.raises(InputError, match="keyframe 1 looks straight along its up"):
         KeyframePath(file).cameras(frame())
 
@@ -80,7 +79,7 @@ def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
     times = (0.0, 1.0, 1.5)
     file = keyframe_file(
         tmp_path,
-        *(Keyframe(p, direction=(1 - p[0], 2 - p[1], 0.0), time=t) for p, t in zip(PLACES, times, strict=True)),
+        *(Keyframe(p, look_at=(1.0, 2.0, p[2]), time=t) for p, t in zip(PLACES, times, strict=True)),
     )
     cameras = KeyframePath(file, fps=10).cameras(frame())
     assert len(cameras.c2w) == 16
@@ -140,7 +139,7 @@ def test_focal_lengths_go_from_keyframe_to_keyframe(tmp_path):
     file = keyframe_file(
         tmp_path,
         Keyframe((5.0, 2.0, 4.0), look_at=(1.0, 2.0, 3.0), fov=90.0),
-        Keyframe((5.0, 3.0, 4.0), look_at=(1.0, 2.0, 3.0), focal=200.0),
+        Keyframe((5.0, 3.0, 4.0), look_at=(1.0, 2.0, 3.0), fov=28.0725),
         Keyframe((5.0, 4.0, 4.0), look_at=(1.0, 2.0, 3.0)),
     )
     path = KeyframePath(file, num_frames=3, width=50)
@@ -182,8 +181,8 @@ def test_a_quaternion_is_its_rotations():
 def test_times_so_uneven_that_the_field_of_view_swings_beyond_all_cameras(tmp_path):
     keys = [
         "{position: [4, 0, 1], look_at: [0, 0, 0.5], fov: 40, time: -809}",
-        "{position: [0, 4, 2], direction: [0, -4, -1.5], up: [0, 0, 1], time: 0.5}",
-        "{position: [-4, 0, 1], look_at: [0, 0, 0.5], focal: 30, time: 1}",
+        "{position: [0, 4, 2], look_at: [0, 0, 0.5], up: [0, 0, 1], time: 0.5}",
+        "{position: [-4, 0, 1], look_at: [0, 0, 0.5], fov: 22.6, time: 1}",
     ]
     (tmp_path / "keys.yaml").write_text("".join(f"- {key}\n" for key in keys))
     scene = ball_scene()

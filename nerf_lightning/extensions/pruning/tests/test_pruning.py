@@ -66,7 +66,7 @@ def test_rays_see_the_same_whatever_stands_where_they_look_nothing_up():
     model.fit_to(ball_scene())
     table, rays = model.last.field.position_encoder.table, some_rays(200)
     torch.nn.init.normal_(table)
-    model.last.sampler.grid.occupy(torch.rand(1, 12, 12, 12) < 0.01)
+    model.last.sampler.grid.occupy(torch.rand(12, 12, 12) < 0.01)
     reached = reached_entries(model.last)
     assert 0 < int(reached.sum()) < 0.8 * reached.numel()
     with torch.no_grad():

@@ -7,8 +7,8 @@ import torch
 from looking import looking_model, rays_of_views
 from support.scenes import ball_scene
 
-from nerf_lightning.data.captures.joined import joined
 from nerf_lightning.evaluation.evaluator import Scoring
+from nerf_lightning.extensions.many_scenes.joined import joined
 from nerf_lightning.extensions.view_transformer.nearest_view import NearestViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field, show_photographs

@@ -1,6 +1,5 @@
 """The hash grid in plain torch: the reference, for any device and dtype."""
 
-import functools
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,7 +17,8 @@ def interpolate_torch(
     table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level."""
-    corners = _corners(points.device)
+    number = torch.arange(8, device=points.device)
+    corners = torch.stack([number & 1, number >> 1 & 1, number >> 2], dim=-1)
     features = []
     for level, resolution in enumerate(layout.resolutions):
         scaled = points.clamp(0.0, 1.0) * resolution
@@ -28,12 +28,6 @@ def interpolate_torch(
         entries = table[_entries(cell[:, None, :] + corners, level, layout)]
         features.append((weights[..., None].to(table.dtype) * entries).sum(dim=1))
     return torch.cat(features, dim=-1)
-
-
-# Kept: copied from the host in each call, a GPU's host would wait for it.
-@functools.cache
-def _corners(device: torch.device) -> Int[Tensor, "8 3"]:
-    return torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], device=device)
 
 
 def _entries(vertex: Int[Tensor, "points 8 3"], level: int, layout: "HashGridLayout") -> Int[Tensor, "points 8"]:

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyC
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
-HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+HALF, ONE = np.float32(0.5), np.float32(1.0)
 FAR_AWAY = np.float32(1e30)
 
 
@@ -45,7 +45,7 @@ def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
-    cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    cells, aabb = torch.ones(4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     march(rays, MarchState(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
 
@@ -91,18 +91,6 @@ def _ahead(unit, speed, around):
 
 @njit(fastmath=True)
 @no_type_check
-def _cascade(x, y, z, cascades):
-    # The smallest cascade that holds a point, half its side, and whether any does.
-    reach = max(abs(x), abs(y), abs(z))
-    number, size = 0, ONE
-    while reach > size and number < cascades - 1:
-        number += 1
-        size *= TWO
-    return number, size, reach <= size
-
-
-@njit(fastmath=True)
-@no_type_check
 def _end_of_empty(x, y, z, dx, dy, dz, leap, scale):
     # Distance to the end of what is empty around a point, in units of cells: its cell, or blocks; a hair short.
     around = np.float32(0.0)
@@ -129,23 +117,21 @@ def _skip(lattice, jitter, k, t, ahead):
 @no_type_check
 def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k):
     """Return the first interval from k on that is occupied; the lattice's end where there is none."""
-    end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[1])
-    last = resolution - np.int32(1)
+    end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[0])
+    last, scale = resolution - np.int32(1), HALF * np.float32(resolution)
     while k < end:
         t = middle(lattice, jitter, k)
         if t > leave:
             break
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        cascade, size, inside = _cascade(x, y, z, cells.shape[0])
-        if not inside:
+        if max(abs(x), abs(y), abs(z)) > ONE:
             k += 1
             continue
-        scale = HALF * np.float32(resolution) / size
-        x, y, z = (x + size) * scale, (y + size) * scale, (z + size) * scale
+        x, y, z = (x + ONE) * scale, (y + ONE) * scale, (z + ONE) * scale
         a, b, c = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
-        if cells[cascade, a, b, c]:
+        if cells[a, b, c]:
             return k
-        leap = leaps[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
+        leap = leaps[a // BLOCK, b // BLOCK, c // BLOCK]
         k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, leap, scale))
     return end
 

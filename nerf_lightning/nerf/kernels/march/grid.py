@@ -21,30 +21,29 @@ class OccupancyCells(TensorStruct):
     """Which cells may hold something."""
 
     aabb: Float[Tensor, "2 3"]
-    """The box of cascade 0."""
-    cells: UInt8[Tensor, "cascades x y z"]
+    """The box that holds them."""
+    cells: UInt8[Tensor, "x y z"]
     """1 where occupied."""
-    leaps: UInt8[Tensor, "cascades a b c"]
+    leaps: UInt8[Tensor, "a b c"]
     """What `leaps_over` says of each block of cells: how much around it is empty."""
 
 
-def blocks_of(cells: UInt8[Tensor, "cascades x y z"]) -> UInt8[Tensor, "cascades a b c"]:
+def blocks_of(cells: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "a b c"]:
     """Return which blocks of cells hold an occupied one; the grid's side is a multiple of 4."""
-    return functional.max_pool3d(cells.float(), BLOCK).to(torch.uint8)
+    return functional.max_pool3d(cells.float()[None], BLOCK)[0].to(torch.uint8)
 
 
-def leaps_over(blocks: UInt8[Tensor, "cascades a b c"]) -> UInt8[Tensor, "cascades a b c"]:
+def leaps_over(blocks: UInt8[Tensor, "a b c"]) -> UInt8[Tensor, "a b c"]:
     """Return how far from each block the next occupied one is, in blocks along the axis where it is farthest.
 
-    0 for a block that is occupied, 1 for a neighbour, `FARTHEST` at most. Where boxes lie in each other 1 at most: what
-    lies around a block may be another box's to say.
+    0 for a block that is occupied, 1 for a neighbour, `FARTHEST` at most.
     """
-    reached = blocks.float()
+    reached = blocks.float()[None]
     leaps = torch.zeros_like(reached)
-    for _ in range(FARTHEST if blocks.shape[0] == 1 else 1):
+    for _ in range(FARTHEST):
         leaps += 1.0 - reached
         reached = functional.max_pool3d(reached, 3, stride=1, padding=1)
-    return leaps.to(torch.uint8)
+    return leaps[0].to(torch.uint8)
 
 
 @dataclass(frozen=True)

@@ -44,18 +44,12 @@ def occupied_intervals(
 
 
 def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
-    """Tell which positions lie in an occupied cell of the smallest cascade that holds them."""
-    cascades, resolution = grid.cells.shape[:2]
+    """Tell which positions lie in an occupied cell."""
+    resolution = grid.cells.shape[0]
     center, half = center_and_half(grid.aabb)
     scaled = (positions - center) / half
-    reach = scaled.abs().amax(dim=-1)
-    cascade = torch.zeros_like(reach, dtype=torch.long)
-    for number in range(cascades - 1):
-        cascade += (reach > 2.0**number).long()
-    unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
-    cell = (unit * resolution).long().clamp(0, resolution - 1)
-    cell_index = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
-    return (reach <= 2.0 ** (cascades - 1)) & grid.cells[cell_index].bool()
+    cell = ((0.5 * scaled + 0.5) * resolution).long().clamp(0, resolution - 1)
+    return (scaled.abs().amax(dim=-1) <= 1.0) & grid.cells[cell.unbind(dim=-1)].bool()
 
 
 def _packed(

@@ -2,9 +2,9 @@
 
 What is lost elsewhere is not arithmetic but the way between layers: a framework writes, casts and reads again what here
 stays in 128 rows of activations. Products are of float32 numbers, or, on CPUs with AVX512-BF16, of bfloat16 ones and
-exact; the weights' dtype says which. Sums are float32.
+exact; the weights' dtype says which. Sums are float32. Where there are AMX's tiles, they multiply the bfloat16 ones.
 
-The last layer's width is padded to whole vectors. Words and kinds are those of `vectors.py`.
+The last layer's width is padded to whole vectors. Words and kinds are those of `vectors.py` and `amx.py`.
 """
 
 from collections.abc import Sequence
@@ -18,6 +18,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.mlp import amx
+from nerf_lightning.nerf.kernels.mlp.amx import TILE, close_tiles, is_tiled, multiply_tiles, open_tiles, turn_words
 from nerf_lightning.nerf.kernels.mlp.vectors import (
     LANES,
     bytes_of,
@@ -32,10 +34,13 @@ from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16, tiles_
 
 ROWS = 128
 """So many go through all layers together."""
-KINDS: dict[torch.dtype, Any] = {torch.float32: np.float32(0), torch.bfloat16: np.int32(0)}
-"""What tells the kernels of which numbers words are made."""
 CPU = {} if numba.config.CPU_NAME else llvm.get_host_cpu_features()  # type: ignore[attr-defined]
 """What LLVM knows of this CPU; nothing where numba is told to compile for another."""
+KINDS: dict[torch.dtype, Any] = {
+    torch.float32: np.float32(0),
+    torch.bfloat16: amx.KIND if CPU.get("amx-bf16") and amx.is_allowed() else np.int32(0),
+}
+"""What tells the kernels of which numbers words are made, and what multiplies them."""
 WIDE = bool(CPU.get("avx512f"))
 """Whether there are 32 registers of a whole vector each."""
 
@@ -156,6 +161,9 @@ def address(array):
 def _multiply(kind, x, next_row, next_word, w, y, width, rows, words, adds):
     # All rows of y, which are `width` numbers long, as w's are. As many sums at once as the registers hold.
     row, column = 4 * width, 0
+    if is_tiled(kind) and next_word == 4 and words % TILE == 0:
+        _multiply_by_tiles(kind, x, next_row, w, y, width, rows, words, adds)
+        return
     while WIDE and width - column >= 64:
         for r in range(0, rows, 4):
             from_x, into = x + r * next_row, y + r * row + 4 * column
@@ -176,6 +184,24 @@ def _multiply(kind, x, next_row, next_word, w, y, width, rows, words, adds):
             from_x, into = x + r * next_row, y + r * row + 4 * column
             multiply_block(kind, 4, 1, from_x, next_row, next_word, w + 4 * column, into, row, words, adds)
         column += 16
+
+
+@njit
+@no_type_check
+def _multiply_by_tiles(kind, x, next_row, w, y, width, rows, words, adds):
+    row = 4 * width
+    for r in range(0, rows, 2 * TILE):
+        for c in range(0, width, 2 * TILE):
+            from_x, from_w, into = x + r * next_row, w + 4 * c, y + r * row + 4 * c
+            is_tall, is_broad = rows - r > TILE, width - c > TILE
+            if is_tall and is_broad:
+                multiply_tiles(kind, 2, 2, from_x, next_row, from_w, into, row, words, adds)
+            elif is_tall:
+                multiply_tiles(kind, 2, 1, from_x, next_row, from_w, into, row, words, adds)
+            elif is_broad:
+                multiply_tiles(kind, 1, 2, from_x, next_row, from_w, into, row, words, adds)
+            else:
+                multiply_tiles(kind, 1, 1, from_x, next_row, from_w, into, row, words, adds)
 
 
 @njit(nogil=True, cache=True)
@@ -236,9 +262,19 @@ def _stack_rows(kind, source, next_row, width, target):
 
 @njit
 @no_type_check
+def _turn(source, rows, width, target):
+    # The transpose of rows of words.
+    for r in range(0, rows, TILE):
+        for c in range(0, width, TILE):
+            turn_words(source + 4 * (r * width + c), 4 * width, target + 4 * (c * rows + r), 4 * rows)
+
+
+@njit
+@no_type_check
 def through(kind, x, stride, w, dims, y, into):
     """Send ROWS rows through all layers: numbers at x, with room for all layers' inputs; the end goes to `into`."""
     layers, size = len(dims) - 1, bytes_of(kind)
+    open_tiles(kind)
     for layer in range(layers):
         inner, outer = dims[layer], dims[layer + 1]
         last = layer == layers - 1
@@ -246,6 +282,7 @@ def through(kind, x, stride, w, dims, y, into):
         x, w = x + size * inner, w + size * inner * outer
         if not last:
             _activate(kind, y, outer, x, stride)
+    close_tiles(kind)
 
 
 @njit
@@ -268,21 +305,29 @@ def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inp
         into: where.
     """
     size, before, numbers = bytes_of(kind), 0, 0
+    open_tiles(kind)
     for layer in range(len(dims) - 1):
         before, numbers = before + dims[layer], numbers + dims[layer] * dims[layer + 1]
     for layer in range(len(dims) - 2, -1, -1):
         inner, outer = dims[layer], dims[layer + 1]
         before, numbers = before - inner, numbers - inner * outer
         inputs, words = x + size * before, w + size * numbers
-        _stack_rows(kind, dy, size * outer, outer, upper)
-        _stack_rows(kind, inputs, stride, inner, lower)
         # dW[o, i] = sum over rows of dy[row, o] x[row, i]
-        _multiply(kind, upper, 4, 4 * outer, lower, total + 4 * numbers, inner, outer, ROWS * size // 4, 1)
+        if is_tiled(kind):  # which want what is summed over side by side
+            _stack_rows(kind, dy, size * outer, outer, lower)
+            _turn(lower, ROWS * size // 4, outer, upper)
+            next_row, next_word = ROWS * size, 4
+        else:
+            _stack_rows(kind, dy, size * outer, outer, upper)
+            next_row, next_word = 4, 4 * outer
+        _stack_rows(kind, inputs, stride, inner, lower)
+        _multiply(kind, upper, next_row, next_word, lower, total + 4 * numbers, inner, outer, ROWS * size // 4, 1)
         if layer:
             _multiply(kind, dy, size * outer, 4, words, y, inner, ROWS, outer * size // 4, 0)
             _pass_back(kind, y, inner, inputs, stride, dy)
         elif wants_inputs:
             _multiply(kind, dy, size * outer, 4, words, into, inner, ROWS, outer * size // 4, 0)
+    close_tiles(kind)
 
 
 @njit(nogil=True, cache=True)

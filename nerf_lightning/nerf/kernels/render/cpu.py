@@ -86,7 +86,7 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, MarchState, Tenso
     """Yield a ray, a field, and what the ray marches through, for the widths that conf/model uses."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
-    cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    cells, aabb = torch.ones(*[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     state, lattice = MarchState(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
     for features in (2, 4):

@@ -1,8 +1,8 @@
 """Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
 
-The samples of a part of the rays follow one another, ray by ray, and ROWS of them go from positions to light while they
-are in the cache. The way back takes the blocks from the last to the first, so that of each ray those samples come first
-that lie farthest, and sums up what lies behind each.
+The samples of a part of the rays follow one another, ray by ray (in pictures group by group), and ROWS of them go from
+positions to light while they are in the cache. The way back takes the blocks from the last to the first, so that of
+each ray those samples come first that lie farthest, and sums up what lies behind each.
 
 Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
 """
@@ -43,6 +43,9 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
+BESIDE = 64
+"""Of so many neighbouring rays of a picture the first samples come first, then the second ones: they share the grid's
+cells. A batch's rays are no neighbours, and only the samples of one ray are."""
 COPY = np.float32(0)
 """Tells `round_vector` to round to float32, which is to copy."""
 
@@ -231,22 +234,29 @@ class _DenseRays(torch.autograd.Function):
 
 @njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
-def _place(space, first, start, count, block, points):
+def _place(space, first, last, start, count, beside, block, points):
     # Which ray each sample of a block is on, and its distance, length and place, in the unit cube.
     origins, directions, edges, contracted = space
-    owner, t, delta, x, y, z = block
+    owner, column, sample, t, delta, x, y, z = block
     samples = edges.shape[1] - 1
-    r, k = first + start // samples, start % samples
+    group, rest = start // (beside * samples), start % (beside * samples)
+    leftmost = first + group * beside
+    width = min(beside, last - leftmost)
+    k, c = rest // width, rest % width
     for i in range(count):
+        r = leftmost + c
         begin, end = edges[r, k], edges[r, k + 1]
         middle = HALF * (begin + end)
-        owner[i], t[i], delta[i] = r, middle, end - begin
+        owner[i], column[i], sample[i], t[i], delta[i] = r, c, k, middle, end - begin
         x[i] = origins[r, 0] + middle * directions[r, 0]
         y[i] = origins[r, 1] + middle * directions[r, 1]
         z[i] = origins[r, 2] + middle * directions[r, 2]
-        k += 1
+        c += 1
+        if c == width:
+            c, k = 0, k + 1
         if k == samples:
-            r, k = r + 1, 0
+            k, leftmost = 0, leftmost + beside
+            width = min(beside, last - leftmost)
     for i in range(count):
         factor, shift = ONE, ZERO
         if contracted:
@@ -257,19 +267,17 @@ def _place(space, first, start, count, block, points):
 
 @njit
 @no_type_check
-def _composite(count, start, samples, closed, alpha, light, numbers, weights):
-    # Ray by ray from front to back; returns the light behind the last of these samples.
-    k = start % samples
+def _composite(count, closed, block, alpha, lights, numbers, weights):
+    # From front to back; each ray of a group has a column, where the light behind its last sample stands.
+    last = weights.shape[1] - 1
     for i in range(count):
-        if k == 0:
-            light = ONE
+        r, c, k = block[0][i], block[1][i], block[2][i]
+        light = lights[c] if k > 0 else ONE
         w = light * alpha[i]
-        if closed and k == samples - 1:
+        if closed and k == last:
             w, numbers[i, BACK] = light, ZERO
-        light -= w
-        numbers[i, LIGHT], numbers[i, WEIGHT], weights[i] = light, w, w
-        k = k + 1 if k < samples - 1 else 0
-    return light
+        lights[c] = light - w
+        numbers[i, LIGHT], numbers[i, WEIGHT], weights[r, k] = light - w, w, w
 
 
 @njit
@@ -299,8 +307,8 @@ def _color_inputs(count, hidden, flat, outer, owner, of_rays, inputs):
 @njit
 @no_type_check
 def _new_block():
-    floats = np.zeros((5, ROWS), np.float32)
-    return np.zeros(ROWS, np.int64), floats[0], floats[1], floats[2], floats[3], floats[4]
+    whole, floats = np.zeros((3, ROWS), np.int64), np.zeros((5, ROWS), np.float32)
+    return whole[0], whole[1], whole[2], floats[0], floats[1], floats[2], floats[3], floats[4]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -310,25 +318,26 @@ def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of
     density_words, dims, color_words, color_dims = networks
     bias, whole_from, closed, hidden = numbers_of_call
     all_numbers, all_points, density_kept, color_kept = kept
-    all_weights, foreground = out[0].reshape(-1), out[1]
+    weights, foreground = out
     samples, colored = space[2].shape[1] - 1, color_dims.shape[0] > 0
     block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
-    sums, light = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32), ONE
+    sums = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32)
+    beside = 1 if keep else BESIDE
+    lights = np.zeros(beside, np.float32)
     flat, outer = sums.reshape(-1), dims[-1]
     stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
     total = (last - first) * samples
     for start in range(0, total, ROWS):
         count, row = min(ROWS, total - start), start if keep else 0
         numbers, points = all_numbers[row : row + ROWS], all_points[row : row + ROWS]
-        _place(space, first, start, count, block, points)
+        _place(space, first, last, start, count, beside, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + row * stride, address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
         through(kind, x, stride, address(density_words), dims, y, y)
-        absorb(count, flat, outer, bias, space[3], whole_from, block[2], block[1], points, numbers, rooms)
-        weights = all_weights[first * samples + start : first * samples + start + count]
-        light = _composite(count, start, samples, closed, rooms[2], light, numbers, weights)
+        absorb(count, flat, outer, bias, space[3], whole_from, block[4], block[3], points, numbers, rooms)
+        _composite(count, closed, block, rooms[2], lights, numbers, weights)
         if colored:
             _color_inputs(count, hidden, flat, outer, block[0], of_rays, inputs)
             x = address(color_kept) + row * color_stride
@@ -385,7 +394,7 @@ def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
 @no_type_check
 def _move_rays(count, contracted, block, toward, of_origins, of_directions):
     # From gradients of points in the unit cube to those of rays: y = x f / 4 + 1/2, with f = 2 / |x| - 1 / |x|^2.
-    owner, t, _, x, y, z = block
+    owner, _, _, t, _, x, y, z = block
     for i in range(count):
         r, gx, gy, gz = owner[i], toward[i, 0], toward[i, 1], toward[i, 2]
         if contracted:
@@ -426,7 +435,7 @@ def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, 
     for start in range((total - 1) // ROWS * ROWS, -1, -ROWS):
         count, row = min(ROWS, total - start), first * samples + start
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
-        _place(space, first, start, count, block, points)
+        _place(space, first, last, start, count, 1, block, points)
         behind = _composite_back(
             count, start, first, samples, colored, least_slope, grads, numbers, behind, color_outer, flat, raw
         )

@@ -40,15 +40,17 @@ def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, nu
         biased[i] = min(raw[i * outer] + bias, LARGEST_RAW)
     exponentials(biased[:count], density[:count], bits[:count])
     for i in range(count):
-        slope = density[i]
-        if abs(biased[i]) > LARGEST_SLOPE:
-            slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
         if not (everywhere or is_inside(points, i)):
-            density[i] = slope = ZERO
+            density[i] = ZERO
+    for i in range(count):
         share = ONE
         if whole_from > ZERO:
             share = min((t[i] / whole_from) ** 2, ONE)
-        numbers[i, BACK], numbers[i, SHARE] = delta[i] * slope * share, share
+        numbers[i, BACK], numbers[i, SHARE] = delta[i] * density[i] * share, share
+    for i in range(count):
+        if abs(biased[i]) > LARGEST_SLOPE and density[i] > ZERO:  # rare, and a call: apart, the others become vectors
+            slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
+            numbers[i, BACK] = delta[i] * slope * numbers[i, SHARE]
         density[i] *= delta[i]
     absorbed(density[:count], alpha[:count], bits[:count])
 

@@ -1,0 +1,36 @@
+"""What `nerf help WORDS` finds where no setting, group or option has that name: symptoms, options and settings."""
+
+import re
+from collections.abc import Iterator, Sequence
+from textwrap import TextWrapper
+
+from nerf_lightning.config.manual.catalogue import Command
+from nerf_lightning.config.manual.pages import brief, row
+from nerf_lightning.files.folders import conf_folder
+
+MOST = 20
+"""Options and settings that are listed."""
+
+
+def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str:
+    """Return what all the words, or their beginnings, stand in; empty if there is nothing."""
+    begun = [re.compile(rf"\b{re.escape(word[: max(4, len(word) - 2)])}", re.IGNORECASE) for word in words]
+    texts = dict[str, str]()
+    for command in commands:
+        options = (option for group in command.options.values() for option in group)
+        own = (each for each in command.settings if each.text and each.is_own)
+        for key, text in [*((each.key, each.meaning) for each in own), *((each.typed, each.about) for each in options)]:
+            texts.setdefault(key, text)
+    found = [(key, text) for key, text in texts.items() if all(word.search(f"{key} {text}") for word in begun)]
+    return "\n".join([*_symptoms(begun, width), *(row(key, brief(text), width) for key, text in found[:MOST])])
+
+
+def _symptoms(begun: list[re.Pattern[str]], width: int) -> Iterator[str]:
+    """Yield what the page of symptoms says below its headings, as far as it fits."""
+    page = (conf_folder().parent / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    bullets = TextWrapper(width, initial_indent="  * ", subsequent_indent="    ")
+    for section in page.split("\n## ")[1:]:
+        heading, *points = (" ".join(part.split()) for part in section.split("\n* "))
+        fitting = [point for point in points if all(word.search(f"{heading} {point}") for word in begun)]
+        if fitting:
+            yield "\n".join([heading, *map(bullets.fill, fitting), ""])
