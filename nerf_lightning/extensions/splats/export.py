@@ -20,7 +20,7 @@ from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
 from nerf_lightning.extensions.splats.rasterizer import rasterize
-from nerf_lightning.extensions.splats.views import View, photographed, rendered, without_lens
+from nerf_lightning.extensions.splats.views import View, color_behind, photographed, rendered, without_lens
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
@@ -28,7 +28,6 @@ from nerf_lightning.nerf.geometry.frames import directions_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 
@@ -133,8 +132,7 @@ class SplatsExport(Export):
         """Compare splats and field with the photographs of held-out views, or, without them, with each other."""
         split = next(name for name in ("test", "val", "train") if scene.splits.get(name))
         views = evenly_spaced_subset(scene.splits[split], self.max_views)
-        behind = background_colors(record.background, 1, torch.device("cpu"), random=None)
-        background = torch.zeros(3) if behind is None else behind[0]
+        background = color_behind(record.background)
         of_splats, of_field, panels = [], [], None
         for number, view in enumerate(views):
             field = rendered(model, scene, pinholes, view, tile_points, record.background).rgb.clamp(0, 1)

@@ -17,11 +17,12 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.extensions.splats.gaussians import TURN, Gaussians, rotations
+from nerf_lightning.extensions.splats.gaussians import TURN, Gaussians
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
 from nerf_lightning.nerf.geometry.frames import points_to_user, unit_of
+from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
 
 SplatFormat = Literal["ply", "spz", "glb"]
 FINE = 0.05  # SPZ's places are whole numbers of steps, so large a share of the splats' median size or smaller.
@@ -32,33 +33,15 @@ def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
     """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colours."""
     unit = unit_of(matrix)
     rotation = matrix[:3, :3] / unit
-    axes = rotation @ rotations(gaussians.quaternions.double())
+    axes = rotation @ rotation_from_quaternion(gaussians.quaternions.double())
     return Gaussians(
         points_to_user(gaussians.means.double(), matrix),
         gaussians.log_scales + math.log(unit),
-        quaternions(axes).float(),
+        quaternion_from_rotation(axes).float(),
         gaussians.opacity_logits,
         gaussians.sh_dc,
         turned_harmonics(gaussians.sh_rest, rotation),
     )
-
-
-def quaternions(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
-    """Return unit quaternions (w, x, y, z) of rotations, by the largest of four (Shepperd 1978).
-
-    >>> quaternions(torch.diag(torch.tensor([1.0, -1.0, -1.0]))).tolist()
-    [0.0, 1.0, 0.0, 0.0]
-    """
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrices.flatten(-2).unbind(dim=-1)
-    rows = [
-        [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
-        [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
-        [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
-        [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
-    ]
-    candidates = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)  # 4 q_i q, for each i
-    best = candidates.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    return normalize(torch.take_along_dim(candidates, best[..., None, None], dim=-2)[..., 0, :], dim=-1)
 
 
 def turned_harmonics(

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.extensions.splats.gaussians import Gaussians, rotations
+from nerf_lightning.extensions.splats.gaussians import Gaussians
 from nerf_lightning.extensions.splats.rasterizer import rasterize
-from nerf_lightning.extensions.splats.views import View
+from nerf_lightning.extensions.splats.views import View, color_behind
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.kernels.adam.step import adam_step
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
-from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.scene import DRAWN, Background
 
 BETAS, EPS = (0.9, 0.99), 1e-15
@@ -78,8 +78,7 @@ def _in_random_order(views: Sequence[View], generator: torch.Generator) -> Itera
 def _background(background: Background, generator: torch.Generator) -> Float[Tensor, "3"]:
     if background in DRAWN:  # a haze would take its colour
         return torch.rand(3, generator=generator)
-    shown = background_colors(background, 1, torch.device("cpu"), random=None)
-    return torch.zeros(3) if shown is None else shown[0]
+    return color_behind(background)
 
 
 class _State:
@@ -122,7 +121,7 @@ class _State:
         kept[split] = False
         halves = [former.map(lambda each: each[split]) for _ in range(2)]
         offset = torch.randn(len(split), 3, generator=generator) * halves[0].log_scales.exp()
-        offset = (rotations(halves[0].quaternions) @ offset[..., None])[..., 0]
+        offset = (rotation_from_quaternion(halves[0].quaternions) @ offset[..., None])[..., 0]
         for half, sign in zip(halves, (0.5, -0.5), strict=True):
             half.means = half.means + sign * offset
             half.log_scales = half.log_scales - math.log(SMALLER)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras
 
 DILATION = 0.3
@@ -96,24 +97,9 @@ class Projected:
     """Along the camera's axis."""
 
 
-def rotations(quaternions: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
-    """Return the rotation matrices of quaternions (w, x, y, z) of any length.
-
-    >>> rotations(torch.tensor([1.0, 0.0, 0.0, 1.0])).round().tolist()
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    w, x, y, z = normalize(quaternions, dim=-1).unbind(dim=-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
-
-
 def covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
     """Return R diag(s^2) R^T (Eq. 6, arXiv 2308.04079)."""
-    spread = rotations(gaussians.quaternions) * gaussians.log_scales.exp()[:, None, :]
+    spread = rotation_from_quaternion(gaussians.quaternions) * gaussians.log_scales.exp()[:, None, :]
     return spread @ spread.mT
 
 

@@ -98,8 +98,12 @@ def _is_dark(light):
 
 @njit
 @no_type_check
-def _rows(mean_y, reach_y):
-    return max(math.ceil(mean_y - reach_y), 0), min(math.floor(mean_y + reach_y), SIDE - 1)
+def _splat(row, x0, y0):
+    # A splat as a tile sees it: mean, conic, opacity, colour, and the rows of pixels that it is visible in.
+    mean_x, mean_y = row[MEAN_X] - np.float32(x0) - HALF, row[MEAN_Y] - np.float32(y0) - HALF
+    top, bottom = max(math.ceil(mean_y - row[REACH_Y]), 0), min(math.floor(mean_y + row[REACH_Y]), SIDE - 1)
+    shape = mean_x, mean_y, row[CONIC_A], row[CONIC_B], row[CONIC_C]
+    return *shape, row[OPACITY], row[RED], row[RED + 1], row[RED + 2], top, bottom
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
@@ -114,11 +118,7 @@ def blend(first, last, across, screen, splats, starts, background, picture):
         for k in range(starts[tile], starts[tile + 1]):
             if (k - starts[tile]) % LOOK == LOOK - 1 and _is_dark(px):
                 break
-            row = screen[splats[k]]
-            mean_x, mean_y = row[MEAN_X] - np.float32(x0) - HALF, row[MEAN_Y] - np.float32(y0) - HALF
-            a, b, c, opacity = row[CONIC_A], row[CONIC_B], row[CONIC_C], row[OPACITY]
-            red, green, blue = row[RED], row[RED + 1], row[RED + 2]
-            top, bottom = _rows(mean_y, row[REACH_Y])
+            mean_x, mean_y, a, b, c, opacity, red, green, blue, top, bottom = _splat(screen[splats[k]], x0, y0)
             for y in range(top, bottom + 1):
                 dy, base = np.float32(y) - mean_y, np.uint64(y * SIDE)
                 for x in range(SIDE):
@@ -162,11 +162,7 @@ def blend_back(first, last, across, screen, splats, starts, picture, gradient, p
         for k in range(starts[tile], starts[tile + 1]):
             if (k - starts[tile]) % LOOK == LOOK - 1 and _is_dark(px):
                 break
-            row = screen[splats[k]]
-            mean_x, mean_y = row[MEAN_X] - np.float32(x0) - HALF, row[MEAN_Y] - np.float32(y0) - HALF
-            a, b, c, opacity = row[CONIC_A], row[CONIC_B], row[CONIC_C], row[OPACITY]
-            red, green, blue = row[RED], row[RED + 1], row[RED + 2]
-            top, bottom = _rows(mean_y, row[REACH_Y])
+            mean_x, mean_y, a, b, c, opacity, red, green, blue, top, bottom = _splat(screen[splats[k]], x0, y0)
             of_opacity = of_x = of_y = of_a = of_b = of_c = of_red = of_green = of_blue = ZERO
             for y in range(top, bottom + 1):
                 dy, base = np.float32(y) - mean_y, np.uint64(y * SIDE)

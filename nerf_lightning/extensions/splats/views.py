@@ -13,6 +13,7 @@ from nerf_lightning.nerf.geometry.lenses import project_plane
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import straight_colors
 
@@ -29,8 +30,13 @@ class View:
 
     def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "height width 3"]:
         """Return the picture over a background."""
-        alpha = self.rgba[..., 3:] / 255.0
-        return self.rgba[..., :3] / 255.0 * alpha + background * (1.0 - alpha)
+        return blend(self.rgba / 255.0, background)
+
+
+def color_behind(background: Background) -> Float[Tensor, "3"]:
+    """Return what is shown behind splats; black where a closed ray has nothing behind it."""
+    shown = background_colors(background, 1, torch.device("cpu"), random=None)
+    return torch.zeros(3) if shown is None else shown[0]
 
 
 def without_lens(cameras: Cameras, longest: int) -> Cameras:

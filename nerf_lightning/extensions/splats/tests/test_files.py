@@ -11,9 +11,11 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.extensions.splats.files import moved, quaternions, save_splats
-from nerf_lightning.extensions.splats.gaussians import Gaussians, colors, covariances, rotations
+from nerf_lightning.extensions.splats.files import moved, save_splats
+from nerf_lightning.extensions.splats.gaussians import Gaussians, colors, covariances
 from nerf_lightning.nerf.geometry.frames import points_to_user, similarity
+from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation as quaternions
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion as rotations
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 MIRRORED = np.array([1.0, -1.0, -1.0])

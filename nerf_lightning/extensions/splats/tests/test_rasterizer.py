@@ -7,9 +7,10 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole, dc_of_color, project, rotations
+from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole, dc_of_color, project
 from nerf_lightning.extensions.splats.rasterizer import rasterize
 from nerf_lightning.extensions.splats.reference import rasterize as reference
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion as rotations
 
 BLACK, WHITE = torch.zeros(3), torch.ones(3)
 RED, GREEN = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]])
