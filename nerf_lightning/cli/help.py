@@ -4,7 +4,6 @@ Hydra has scripts for completion, too. They compose the config at each press of 
 neither our commands nor what a setting takes.
 """
 
-import shutil
 from pathlib import Path
 
 from nerf_lightning.config.manual.candidates import SHELLS, candidates
@@ -13,9 +12,10 @@ from nerf_lightning.config.manual.pages import command_page, page_of
 from nerf_lightning.config.manual.search import search
 from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import terminal_width
 
 FLAGS = ("-h", "--help")
-NARROWEST, WIDEST = 60, 120
+WIDEST = 120
 SCRIPTS = Path(__file__).parent / "completions"
 CANDIDATES = "candidates"  # What the scripts ask for, with the words that have been typed
 
@@ -65,7 +65,7 @@ def _command(name: str) -> Command:
 
 
 def _width() -> int:
-    return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
+    return min(terminal_width(WIDEST), WIDEST)
 
 
 def completion(arguments: list[str], commands: list[str]) -> str:

@@ -6,7 +6,6 @@ Nothing heavy is imported here, so that `nerf --help` answers at once.
 import ast
 import importlib
 import os
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import for_terminal
+from nerf_lightning.messages.escaping import for_terminal, terminal_width
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -116,7 +115,7 @@ def _summary(file: Path) -> str:
 
 def _help(commands: dict[str, str]) -> str:
     width = max(map(len, [*commands, *OF_ITSELF]))
-    columns, indent = min(shutil.get_terminal_size((120, 24)).columns, 120), " " * (width + 4)
+    columns, indent = min(terminal_width(120), 120), " " * (width + 4)
     rows = [f"  {name:<{width}}  {summary}" for name, summary in (commands | OF_ITSELF).items()]
     lines = [fill(row, columns, subsequent_indent=indent) for row in rows]
     return HELP.format("\n".join(lines))

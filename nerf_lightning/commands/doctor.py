@@ -1,6 +1,5 @@
 """Examine a capture before training: poses, lenses, photographs, near and far, with the cure for what is wrong."""
 
-import shutil
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -21,11 +20,12 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StdoutConsole, say, spoken
-from nerf_lightning.messages.escaping import for_terminal
+from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
 
 STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red", "not judged": "dim"}
+UNWRAPPED = 10_000  # Columns where there is no terminal: lines stay whole, to be searched.
 
 
 def run(config: DictConfig) -> int:
@@ -45,7 +45,7 @@ def run(config: DictConfig) -> int:
     if proofs:
         written.append(folder / "doctor_proof.png")
         save_png(written[-1], proof_picture(scene, proofs))
-    say(*wrap(f"capture  {about}", _columns(), subsequent_indent=" " * 9))
+    say(*wrap(f"capture  {about}", terminal_width(UNWRAPPED), subsequent_indent=" " * 9))
     print_checks(checks)
     seconds = time.monotonic() - started
     say(f"{summary(checks)}; {len(scene.view_names)} views examined in {spoken(seconds)}")
@@ -78,7 +78,7 @@ def print_checks(checks: Sequence[Check]) -> None:
     """Print a line per check, what is wrong with its cure below."""
     console = StdoutConsole(highlight=False, soft_wrap=True)
     width = max(len(check.name) for check in checks)
-    lines = TextWrapper(_columns(), subsequent_indent=" " * (width + 14), break_long_words=False)
+    lines = TextWrapper(terminal_width(UNWRAPPED), subsequent_indent=" " * (width + 14), break_long_words=False)
     for check in checks:
         found = Text(lines.fill(f"{check.verdict:<10}  {check.name:<{width}}  {for_terminal(check.message)}"))
         found.stylize(STYLES[check.verdict], 0, len(check.verdict))
@@ -86,8 +86,3 @@ def print_checks(checks: Sequence[Check]) -> None:
         if check.cure:
             label = "needs" if check.verdict == "not judged" else "cure"
             console.print(Text(lines.fill(f"{'':<{width + 14}}{label}: {for_terminal(check.cure)}")))
-
-
-def _columns() -> int:
-    """Return the width of the terminal; where there is none, lines stay whole, to be searched."""
-    return max(shutil.get_terminal_size((10_000, 24)).columns, 60)

@@ -7,6 +7,7 @@ it holds is shown, as Python would write it, and never acted on.
 import html
 import logging
 import re
+import shutil
 import unicodedata
 from collections.abc import Iterable
 from typing import Any
@@ -22,6 +23,7 @@ ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
 UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
 JOINERS = "\u200c\u200d"
+NARROWEST = 60  # Columns that text is wrapped to
 MOST_CHARACTERS = 1024  # Of the name of a photograph or of a scene
 LONGEST_FILE_NAME = 200  # In bytes; file systems take 255, and endings are added
 
@@ -89,6 +91,11 @@ def for_file_name(name: str) -> str:
     """
     plain = "".join("_" if letter in '/\\<>:"|?*' or _is_unprintable(letter) else letter for letter in name)
     return plain.encode()[:LONGEST_FILE_NAME].decode(errors="ignore")
+
+
+def terminal_width(otherwise: int) -> int:
+    """Return how many columns text is wrapped to: the terminal's; where there is none, as many as are given."""
+    return max(shutil.get_terminal_size((otherwise, 24)).columns, NARROWEST)
 
 
 def is_plain(name: str) -> bool:
