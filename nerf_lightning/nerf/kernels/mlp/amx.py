@@ -1,7 +1,7 @@
 """Products of bfloat16 matrices by AMX: tiles of 16 rows of 64 bytes, on Intel's servers since Sapphire Rapids.
 
-One instruction multiplies two tiles: 8,192 products in 16 cycles, eight times what AVX512-BF16 does there. The sums are
-float32. Linux lets a process use the tiles once it has asked, which torch does.
+One instruction multiplies two tiles: 8,192 products, where one of AVX512-BF16 has 32. The sums are float32. Linux lets
+a process use the tiles once it has asked, which torch does.
 
 Addresses and words are those of `vectors.py`.
 """
