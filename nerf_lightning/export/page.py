@@ -10,13 +10,17 @@ from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export, require_setting
 from nerf_lightning.export.page_file import is_page, write_page
+from nerf_lightning.export.page_marks import Marks, read_marks
 from nerf_lightning.export.voxel_kernels.layout import ROOM
+from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord, Space
 
 Quality = Literal["small", "medium", "large"]
+MARKS = "views.json"  # What is kept next to the page.
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 # Voxels along the longest side of what there is,
 RESOLUTIONS: dict[Space, dict[Quality, int]] = {
@@ -46,6 +50,11 @@ class PageExport(Export):
         max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
         fit_steps: so many steps move the bytes towards the photographs that the model learnt from; 0: they stay as
             baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
+        title: what the page is called; None: as the scene.
+        views: file of named views, notes and distances (`page_marks`), which is then kept as `views.json` next to the
+            page; None: the one that lies there, if any.
+        first_view: name of a view of that file, or of a photograph, with which the page begins; None: the training
+            view nearest to their average.
     """
 
     needs_photographs = True
@@ -57,6 +66,9 @@ class PageExport(Export):
     photographs: int = 24
     max_views: int = 8
     fit_steps: int = 60
+    title: str | None = None
+    views: str | None = None
+    first_view: str | None = None
 
     def __post_init__(self) -> None:
         enough = self.resolution is None or self.resolution >= 8
@@ -72,6 +84,7 @@ class PageExport(Export):
         if target.is_dir() or (target.exists() and not is_page(target)):
             kind = "a folder" if target.is_dir() else "a file that is no page of this program"
             raise InputError(f"{target} is {kind}, and would be lost. Move it away, or give paths.output_dir=DIR.")
+        marks = self._marks(record, folder)
         with StageProgress(COSTS) as report:
             resolution = self.resolution or RESOLUTIONS[record.space][self.quality]
             baked = bake(model, record, resolution, HARMONICS[record.space][self.quality], tile_points, report)
@@ -80,7 +93,23 @@ class PageExport(Export):
                 baked = fitted(baked, photographs, record, self.fit_steps, report)
             marcher = Marcher(baked)
             cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
-        write_page(target, marcher, record, self.beside, self.photographs, cost.facts())
+        chosen = (marks, self.title, self.first_view)
+        write_page(target, marcher, record, self.beside, self.photographs, cost.facts(), *chosen)
+        if self.views is not None:
+            write_json(folder / MARKS, marks)
         size = f"{target.stat().st_size / 1e6:.1f} MB (what.quality={self.quality})"
         say(*(f"{name:<12} {fact}" for name, fact in [("size", size), *cost.facts()]))
         return [target]
+
+    def _marks(self, record: SceneRecord, folder: Path) -> Marks:
+        kept = folder / MARKS
+        path = kept if self.views is None and kept.is_file() else self.views and Path(self.views).expanduser()
+        marks = read_marks(path or None, record)
+        names = [view["name"] for view in marks["views"]]
+        if self.first_view is not None and self.first_view not in (*names, *record.view_names):
+            views = f"views: {listed(names)}; " if names else ""
+            raise InputError(
+                f"what.first_view={self.first_view}: there is no view or photograph of this name. Choose one of them "
+                f"({views}photographs: {listed(record.view_names)})."
+            )
+        return marks

@@ -3,6 +3,8 @@
 import base64
 import io
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +15,19 @@ from jaxtyping import Float
 from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.export.baking.baked_field import BakedField, described, serialized
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.base import PageExtras
+from nerf_lightning.export.page_marks import Marks
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
+from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
@@ -31,12 +36,14 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
-SCRIPTS = ("page.js", "path.js")
+SCRIPTS = ("page.js", "path.js", "marks.js")
 MARK = b"<!-- nerf_lightning page 1 -->"
 BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 STILL, PHOTOGRAPH = 640, 320  # Pixels of the longer side: of the still picture, of photographs.
 JPEG_QUALITY = 80
 PART_OF_PANORAMA = 1.5  # How much is seen around a panorama's direction, in radians.
+# Cameras that leave a wider gap do not stand all around: the page then turns to and fro, so far to either side at most.
+WIDEST_GAP, MOST_SWAY = 120.0, 20.0  # Degrees.
 
 
 @dataclass(frozen=True)
@@ -55,20 +62,37 @@ def write_page(
     beside: PageExtras,
     max_photographs: int,
     facts: list[tuple[str, str]],
+    marks: Marks,
+    title: str | None = None,
+    first_view: str | None = None,
 ) -> None:
-    """Write the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
+    """Write the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to.
+
+    It begins with the view of `marks`, or the photograph, that is called `first_view`, which is one of them; None: with
+    the training view nearest to their average.
+    """
     field = serialized(marcher.baked)
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
+    names = [view["name"] for view in marks["views"]]
+    if first_view in record.view_names and first_view not in names:
+        views = sorted({*views[1:], record.view_names.index(first_view)})
+        first = record.view_names.index(first_view)
+    else:
+        first = average_view(record, views)
     middle, radius = _middle(marcher.baked, record)
-    up = record.cameras.c2w[:, :, 1].mean(dim=0)
+    up = functional.normalize(record.cameras.c2w[:, :, 1].mean(dim=0), dim=0)
     about = described(marcher.baked) | {
         "bytes": len(field),
         "step": STEP,
         "cameras": [_camera(record.cameras, view) for view in views],
-        "first": 0,
+        "first": views.index(first),
+        "first_view": names.index(first_view) if first_view in names else None,
+        "marks": marks,
+        "metres": record.metres_per_unit,
+        "sway": sway(record, middle, up),
         "middle": middle,
         "radius": radius,
-        "up": (up / up.norm().clamp(min=1e-6)).tolist(),
+        "up": up.tolist(),
         "ndc": None if record.cameras.ndc is None else record.cameras.ndc[0].tolist(),
         "path": list(beside.keyframes),
         "to_user": record.to_user.tolist(),
@@ -77,9 +101,9 @@ def write_page(
     }
     grid = f"{' x '.join(str(8 * count) for count in marcher.baked.shape)}, {about['blocks']:,} blocks of 8 x 8 x 8"
     cameras = at_most(record.cameras, STILL)
-    rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, views[0]))[0]
+    rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, first))[0]
     page = {
-        "title": record.name,
+        "title": title or record.name,
         "facts": [("scene", record.name), *beside.facts, *facts, ("grid", grid)],
         "views": [_view(record, beside, view if max_photographs else None) for view in views],
         "still": _jpeg(over(marcher.render(rays), record.background), STILL),
@@ -112,6 +136,29 @@ def is_page(path: Path) -> bool:
             return MARK in file.read(200)
     except InputError:
         return False
+
+
+def average_view(record: SceneRecord, views: Sequence[int]) -> int:
+    """Return that of the views, a training view if any is, whose camera is nearest to the training cameras' mean.
+
+    The model knows most about what lies there, and it is held as most photographs are.
+    """
+    train = set(record.splits["train"])
+    candidates = [view for view in views if view in train] or list(views)
+    known = record.cameras.c2w[sorted(train)]
+    spread = known[:, :, 3].std(dim=0, correction=0).norm().clamp(min=1e-6)
+    apart = record.cameras.c2w[candidates] - known.mean(dim=0)
+    apart[:, :, 3] /= spread
+    return candidates[int(apart.flatten(1).norm(dim=1).argmin())]
+
+
+def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -> float | None:
+    """Return how far the page turns to either side, in radians; None: all around, as the training cameras stand."""
+    away = record.cameras.c2w[list(record.splits["train"]), :, 3] - torch.tensor(middle)
+    first = functional.normalize(away[0] - (away[0] @ up) * up, dim=0)
+    azimuth = torch.rad2deg(torch.atan2(away @ torch.linalg.cross(up, first), away @ first))
+    gap = float(gaps_around(azimuth)[1].max())
+    return None if gap < WIDEST_GAP else math.radians(min(MOST_SWAY, (360.0 - gap) / 4))
 
 
 def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]:

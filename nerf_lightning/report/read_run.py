@@ -129,5 +129,6 @@ def _add_coverage(report: Report, run: Path) -> None:
     checkpoint = newest_checkpoint(run / "checkpoints")
     if checkpoint is None:
         raise InputError(f"{run} has no checkpoint")
-    report.title = f"{checkpoint.scene.name}, {checkpoint.choices.get('model', '')}: {report.title}"
+    report.title = f"{checkpoint.scene.name}, {len(checkpoint.scene.view_names)} photographs"
+    report.subtitle = f"{checkpoint.choices.get('model', '')}, {report.subtitle}"
     report.coverage = embedded(coverage_picture(checkpoint.scene).numpy())

@@ -1,35 +1,26 @@
 """The page in a real browser: it shows what the marcher computes, asks for nothing, and says what is wrong."""
 
-import io
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from support.baked_ball import all_around, beside, read_baked, record_of, shiny_model
 from support.browser import drag, opened
 from support.contracted_hall import hall_model, hall_scene
+from support.page_in_browser import MESSAGE, marched, marched_through, press, psnr, shot, wait_for, wait_until_there
 
 from nerf_lightning.commands.export import page_path
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.export.baking.cost import over
-from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.page import PageExport
-from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import similarity
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import view_rays
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, lay_path, make_shots
 
 pytestmark = pytest.mark.slow
 
-STATE = "return document.body.dataset.state"
-MESSAGE = "return document.getElementById('message').textContent"
 WITHOUT = "HTMLCanvasElement.prototype.getContext = () => null;"
 
 
@@ -42,40 +33,6 @@ def page(request, tmp_path_factory):
         return what.export(shiny_model(), record_of(scene), tmp_path_factory.mktemp("page"), 4096)[0]
 
 
-def wait_for(driver, *states: str) -> None:
-    end = time.monotonic() + 90
-    while driver.execute_script(STATE) not in states:
-        assert time.monotonic() < end, driver.execute_script(MESSAGE)
-        time.sleep(0.2)
-
-
-def shot(driver) -> np.ndarray:
-    return np.array(Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")).astype(float) / 255
-
-
-def press(driver, key: str) -> None:
-    event = "new KeyboardEvent('keydown', {key: arguments[0], bubbles: true})"
-    driver.execute_script(f"document.body.dispatchEvent({event})", key)
-
-
-def marched(page, view: int, width: int, height: int, behind="white") -> np.ndarray:
-    """What the file shows through a camera in a window, its picture in the middle."""
-    lens = read_baked(page)[0]["cameras"][view]
-    c2w = torch.tensor([*lens["axes"], lens["eye"]]).T
-    return marched_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height, behind)
-
-
-def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
-    scale = min(width / size[0], height / size[1])
-    cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
-    rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), all_pixels(cameras, 0))
-    return over(Marcher(read_baked(page)[1]).render(rays), behind).clamp(0, 1).numpy()
-
-
-def psnr(one, other) -> float:
-    return float(-10 * np.log10(np.mean((one - other) ** 2)))
-
-
 def test_it_shows_what_the_marcher_computes_and_asks_for_nothing(page):
     with opened(page.as_uri(), 256, 360) as driver:
         run = driver.execute_script
@@ -83,7 +40,8 @@ def test_it_shows_what_the_marcher_computes_and_asks_for_nothing(page):
         run("document.body.classList.add('bare')")
         found = shot(driver)
         height, width = found.shape[:2]
-        assert psnr(found, marched(page, 0, width, height)) > 38
+        first = read_baked(page)[0]["first"]
+        assert psnr(found, marched(page, first, width, height)) > 38
         # Not because all is white.
         assert found.std() > 0.1
         assert run("return performance.getEntriesByType('resource').length") == 0
@@ -96,6 +54,15 @@ def test_it_shows_what_the_marcher_computes_and_asks_for_nothing(page):
         drag(driver, 40, 0)
         wait_for(driver, "still")
         assert psnr(shot(driver), before) < 35
+
+
+@pytest.mark.parametrize("page", ["small"], indirect=True)
+def test_firefox_shows_it_too(page):
+    with opened(page.as_uri(), 500, 500, "Firefox") as driver:
+        wait_for(driver, "still")
+        driver.execute_script("document.body.classList.add('bare')")
+        found = shot(driver)
+        assert psnr(found, marched(page, read_baked(page)[0]["first"], *found.shape[1::-1])) > 36
 
 
 @pytest.mark.parametrize("page", ["small"], indirect=True)
@@ -130,7 +97,7 @@ def test_a_scene_without_bounds_is_shown_as_the_marcher_computes_it(tmp_path):
         driver.execute_script("document.body.classList.add('bare')")
         found = shot(driver)
         height, width = found.shape[:2]
-        assert psnr(found, marched(page, 0, width, height, "black")) > 38
+        assert psnr(found, marched(page, read_baked(page)[0]["first"], width, height, "black")) > 38
         assert found.std() > 0.1
         assert found.min(axis=2).mean() > 0.05  # the wall is there
         assert driver.get_log("browser") == []
@@ -180,13 +147,14 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
         assert run("return document.getElementById('play').textContent") == "pause"
         press(driver, " ")
         wait_for(driver, "still")
+        run("window.prompt = (_, name) => name")
         for view in range(3):
             run(f"document.querySelectorAll('#photographs button')[{view}].click()")
             drag(driver, 30, 10)
             wait_for(driver, "still")
             recorded = shot(driver)
-            press(driver, "k")
-        assert run("return document.getElementById('length').value") == "3 keyframes, 4.0 s"
+            press(driver, "v")
+        assert run("return document.getElementById('length').value") == "4.0 s"
         run("document.getElementById('save').click()")
         file = tmp_path / "camera_path.yaml"
         wait_until_there(file)
@@ -197,19 +165,14 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
             found = to_second(driver, second)
             assert psnr(found, seen_by(path, page, record, second, found)) > 38
         assert psnr(found, recorded) > 38
-        run("for (const _ of [1, 2, 3]) document.getElementById('remove').click()")
+        run(
+            "for (const _ of [1, 2]) document.querySelector('#views button').click(), document.getElementById('remove-mark').click()"
+        )
         assert run("return document.getElementById('length').value") == "10.0 s"
         assert driver.get_log("browser") == []
     # And filmed by the program itself.
     shots = make_shots([Subject(shiny_model(), record, "white")], replace_frames(path, 3), 4096)
     assert float(shots[0].picture(1).opacity.max()) > 0.9
-
-
-def wait_until_there(file) -> None:
-    end = time.monotonic() + 30
-    while not file.exists():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 def replace_frames(path: KeyframePath, num_frames: int) -> KeyframePath:

@@ -16,37 +16,45 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
+    "--force-prefers-reduced-motion",
     "--no-first-run",
     "--disable-background-networking",
 )
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+# What each browser is called, its driver, and where both come from.
+BROWSERS = {
+    "Chromium": (("chromium", "chromium-browser", "google-chrome"), "chromedriver", "chromium chromium-driver"),
+    "Firefox": (("firefox", "firefox-esr"), "geckodriver", "firefox-esr, and geckodriver from its releases"),
+}
 
 
-def why_no_browser() -> str | None:
+def why_no_browser(browser: str = "Chromium") -> str | None:
     """Return why no browser can be driven here, and what to do about it; None where one can."""
     try:
         import selenium  # noqa: F401
     except ImportError:
         return "selenium is not installed: pip install selenium"
-    if not any(map(shutil.which, BROWSERS)) or not shutil.which("chromedriver"):
-        return "no Chromium with its driver here (Debian: apt install chromium chromium-driver)"
+    names, driver, packages = BROWSERS[browser]
+    if not any(map(shutil.which, names)) or not shutil.which(driver):
+        return f"no {browser} with its driver here (Debian: apt install {packages})"
     return None
 
 
 @contextmanager
-def opened(address: str, width: int = 800, height: int = 600):
+def opened(address: str, width: int = 800, height: int = 600, browser: str = "Chromium"):
     """Open a page; skip the test where there is no browser."""
-    reason = why_no_browser()
+    reason = why_no_browser(browser)
     if reason is not None:
         pytest.skip(reason)
-    from selenium.webdriver import Chrome, ChromeOptions
-    from selenium.webdriver.chrome.service import Service
+    from selenium import webdriver
 
-    options = ChromeOptions()
-    options.binary_location = next(filter(None, map(shutil.which, BROWSERS)))
-    for flag in (*FLAGS, f"--window-size={width},{height}"):
+    names, driver_name, _ = BROWSERS[browser]
+    kind, flags = ("Chrome", FLAGS) if browser == "Chromium" else ("Firefox", ("-headless",))
+    options = getattr(webdriver, f"{kind}Options")()
+    options.binary_location = next(filter(None, map(shutil.which, names)))
+    for flag in (*flags, f"--window-size={width},{height}"):
         options.add_argument(flag)
-    driver = Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    service = getattr(webdriver, f"{kind}Service")(shutil.which(driver_name))
+    driver = getattr(webdriver, kind)(options=options, service=service)
     try:
         driver.set_page_load_timeout(120)
         driver.get(address)

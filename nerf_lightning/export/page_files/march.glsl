@@ -25,6 +25,7 @@ uniform vec2 focal, center, exponents, ranges, depths;
 uniform int shown;
 #ifdef NDC
 uniform vec2 ndc;
+vec2 start_z;  // of a ray in normalised device coordinates, and how it grows
 #endif
 #ifdef CONTRACTED
 uniform vec3 middle;
@@ -69,7 +70,8 @@ vec3 slope(vec3 start, vec3 within) {
   return found;
 }
 
-float through = 1.0, depth = 0.0;
+// `hit` is where half of the light is stopped.
+float through = 1.0, depth = 0.0, hit = 0.0;
 vec3 color = vec3(0.0), normal = vec3(0.0);
 
 // What a step of a share of a voxel's length stops at a place of a block, at a distance in the scene.
@@ -87,6 +89,7 @@ void stop(int tile, vec3 within, float share, float away, vec3 look) {
     color += weight * harmonic_color(coordinate, value.xyz, look);
   }
   depth += weight * away;
+  if (through > 0.5 && through * (1.0 - alpha) <= 0.5) hit = away;
   through *= 1.0 - alpha;
 }
 
@@ -140,6 +143,7 @@ void march(vec3 origin, vec3 look) {
   vec3 start_point = vec3(-ndc * origin.xy / origin.z, 1.0 + 2.0 / origin.z);
   along = normalize(vec3(-ndc * look.xy / look.z, 1.0) - start_point);
   origin = start_point;
+  start_z = vec2(origin.z, along.z);
 #endif
   origin = (origin - lower) / spacing;
   along /= spacing;
@@ -185,4 +189,8 @@ void main() {
     color = opacity * (0.5 + 0.5 * normal / max(length(normal), 1e-6));
   }
   pixel = vec4(color + (1.0 - opacity) * behind, 1.0);
+#ifdef NDC
+  if (hit > 0.0) hit = (2.0 / (start_z.x + hit * start_z.y - 1.0) - eye.z) / look.z;
+#endif
+  if (shown == 3) pixel = vec4(vec3(uvec3(floatBitsToUint(hit)) >> uvec3(8, 16, 24) & 255u) / 255.0, 1.0);
 }

@@ -119,6 +119,13 @@ function atlasOf(blocks, most) {
 
 // ---- The picture -------------------------------------------------------------------------------------------------
 
+// Focal length and principal point of a lens that fits into a window, its middle in the window's.
+function lensIn(lens, width, height) {
+  const scale = Math.min(width / lens.width, height / lens.height), middle = [width / 2, height / 2];
+  const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
+  return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
+}
+
 const NAMES = ["base", "more0", "more1", "more2", "more3", "more4", "more5"];
 
 class Picture {
@@ -133,6 +140,7 @@ class Picture {
     this.atlas = atlasOf(about.blocks, gl.getParameter(gl.MAX_3D_TEXTURE_SIZE));
     this.program = this.linked();
     gl.useProgram(this.program);
+    gl.disable(gl.DITHER);
     this.upload(field);
     this.fix();
   }
@@ -202,22 +210,34 @@ class Picture {
     }
   }
 
-  // The lens fits into the window, its middle in the window's; `share` of the window's pixels along each side.
+  // `share` of the window's pixels along each side.
   draw(view, share) {
-    const gl = this.gl, ratio = share * window.devicePixelRatio;
+    const ratio = share * window.devicePixelRatio;
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
+    this.trace(view, lensIn(view.lens, width, height), width, height, view.shown);
+  }
+
+  // How far away the surface is at a place of the window (in pixels of CSS), along the ray; 0: there is none.
+  depth(view, x, y) {
+    const gl = this.gl, bytes = new Uint8Array(4), { focal, center } = lensIn(view.lens, innerWidth, innerHeight);
+    this.trace(view, { focal, center: [center[0] - x + 0.5, center[1] - y + 0.5] }, 1, 1, 3);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    return new Float32Array(new Uint8Array([0, ...bytes.slice(0, 3)]).buffer)[0];
+  }
+
+  trace(view, { focal, center }, width, height, shown) {
+    const gl = this.gl;
     gl.viewport(0, 0, width, height);
-    const lens = view.lens, scale = Math.min(width / lens.width, height / lens.height);
     gl.uniform1f(this.at("height"), height);
-    gl.uniform2f(this.at("focal"), scale * lens.focal[0], scale * lens.focal[1]);
-    gl.uniform2f(this.at("center"), width / 2 + scale * (lens.center[0] - lens.width / 2), height / 2 + scale * (lens.center[1] - lens.height / 2));
+    gl.uniform2fv(this.at("focal"), focal);
+    gl.uniform2fv(this.at("center"), center);
     gl.uniform3fv(this.at("eye"), view.eye);
     gl.uniformMatrix3fv(this.at("turn"), false, view.axes.flat());
     gl.uniform3fv(this.at("behind"), view.behind);
-    gl.uniform1i(this.at("shown"), view.shown);
+    gl.uniform1i(this.at("shown"), shown);
     const away = length(minus(view.eye, this.about.middle));
     gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -295,19 +315,42 @@ class View {
 // ---- Frames: coarse while something moves, as fine as the screen when nothing does -------------------------------
 
 const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.15;
+const TURN = 24;  // seconds for once around, or to and fro
 
 class Frames {
   constructor(picture, view) {
     Object.assign(this, { picture, view, share: 0.6, movedAt: -Infinity, before: 0, waits: false, keys: new Set() });
+    Object.assign(this, { turning: false, turned: 0 });
     this.player = new Player(this);
+    this.marks = new Marks(this);
     this.step = this.step.bind(this);
   }
 
-  // Whoever takes the camera stops the one that goes along the path.
-  moved() {
+  // Whoever takes the camera stops the turntable, and what goes along the path.
+  stop() {
     this.player.pause();
+    this.turn(false);
+  }
+
+  moved() {
+    this.stop();
     this.movedAt = performance.now();
     this.ask();
+  }
+
+  turn(on) {
+    if (on) this.player.pause();
+    this.turning = on;
+    byId("turn").setAttribute("aria-pressed", String(on));
+    this.ask();
+  }
+
+  // All around, or to and fro where the photographs were taken from one side.
+  turntable(seconds) {
+    const share = (at) => 2 * Math.PI * at / TURN, { sway } = this.view.about;
+    const angle = (at) => (sway === null ? share(at) : sway * Math.sin(share(at)));
+    this.view.orbit(angle(this.turned + seconds) - angle(this.turned), 0);
+    this.turned += seconds;
   }
 
   ask() {
@@ -322,8 +365,10 @@ class Frames {
     this.before = now;
     if (this.keys.size && elapsed < 500) fly(this, elapsed / 1000);
     if (this.player.playing) this.player.advance();
+    if (this.turning) this.turntable(Math.min(elapsed, 200) / 1000);
     place(this.view);
-    if (this.keys.size || this.player.playing || performance.now() - this.movedAt < PAUSE) {
+    this.marks.place();
+    if (this.keys.size || this.player.playing || this.turning || performance.now() - this.movedAt < PAUSE) {
       if (elapsed > SLOW && elapsed < 1000) this.share = Math.max(COARSEST, 0.85 * this.share);
       if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
       this.picture.draw(this.view, this.share);
@@ -357,7 +402,7 @@ function place(view) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
   if (!source) return;
-  const scale = Math.min(innerWidth / view.lens.width, innerHeight / view.lens.height);
+  const { scale } = lensIn(view.lens, innerWidth, innerHeight);
   const [width, height] = [scale * view.lens.width, scale * view.lens.height];
   Object.assign(photograph.style, { width: `${width}px`, height: `${height}px`, left: `${(innerWidth - width) / 2}px`, top: `${(innerHeight - height) / 2}px` });
   photograph.style.setProperty("--at", `${byId("wipe").value}%`);
@@ -371,15 +416,23 @@ function sourceOf(number) {
 
 // ---- Mouse, fingers, keys, buttons -------------------------------------------------------------------------------
 
+const TAP = 5;  // pixels that a pointer moves at most while it taps
+
 function listenToPointers(canvas, frames) {
   const fingers = new Map(), view = frames.view;
+  let pressed = null;
   const middle = () => [...fingers.values()].reduce((sum, at) => plus(sum, at, 1 / fingers.size), [0, 0]);
   const apart = () => length(minus(...[...fingers.values()].slice(0, 2)));
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
+    pressed = fingers.size ? null : [event.clientX, event.clientY];
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
+  canvas.addEventListener("pointerup", (event) => {
+    const at = [event.clientX, event.clientY];
+    if (pressed !== null && length(minus(at, pressed)) < TAP) frames.marks.tap(...at);
+  });
   canvas.addEventListener("pointermove", (event) => {
     if (!fingers.has(event.pointerId)) return;
     const [before, wide] = [middle(), fingers.size > 1 ? apart() : 0];
@@ -404,13 +457,15 @@ function listenToKeys(frames) {
   const held = (key) => key in FLIGHT || key in TURNS || key in ZOOMS;
   const once = {
     1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
-    b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => jump(frames, frames.view.about.first),
-    i: () => byId("numbers").showModal(), " ": () => frames.player.toggle(), k: () => frames.player.add(), "[": () => next(frames, -1), "]": () => next(frames, 1),
+    b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => home(frames),
+    i: () => byId("numbers").showModal(), t: () => frames.turn(!frames.turning), f: fullScreen, p: () => savePicture(frames), v: () => frames.marks.addView(),
+    n: () => frames.marks.begin("note"), m: () => frames.marks.begin("distance"), escape: () => frames.marks.end(), enter: () => frames.marks.tap(innerWidth / 2, innerHeight / 2), delete: () => frames.marks.remove(),
+    " ": () => frames.player.toggle(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
     const key = event.key.toLowerCase();
     if (event.ctrlKey || event.metaKey || event.altKey || byId("numbers").open || event.target.matches("input, select")) return;
-    if (key === " " && event.target.matches("button")) return;  // it is pressed by that
+    if ((key === " " || key === "enter") && event.target.matches("button, summary")) return;  // it is pressed by that
     if (held(key)) {
       event.preventDefault();
       frames.keys.add(key);
@@ -427,10 +482,27 @@ function show(frames, what) {
   frames.ask();
 }
 
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen();
+}
+
+function savePicture(frames) {
+  frames.picture.draw(frames.view, 1);
+  frames.picture.canvas.toBlob((blob) => save("scene.png", blob));
+}
+
 function jump(frames, number) {
-  frames.player.pause();
+  frames.stop();
   frames.view.jump(number);
   frames.ask();
+}
+
+// The view that it begins with.
+function home(frames) {
+  const { about } = frames.view, named = about.marks.views[about.first_view];
+  if (named) frames.marks.show(named);
+  else jump(frames, about.first);
 }
 
 function next(frames, by) {
@@ -441,7 +513,14 @@ function next(frames, by) {
 function listenToControls(frames) {
   byId("shown").addEventListener("change", (event) => show(frames, Number(event.target.value)));
   byId("wipe").addEventListener("input", () => place(frames.view));
-  byId("back").addEventListener("click", () => jump(frames, frames.view.about.first));
+  byId("back").addEventListener("click", () => home(frames));
+  byId("turn").addEventListener("click", () => frames.turn(!frames.turning));
+  byId("picture").addEventListener("click", () => savePicture(frames));
+  byId("full").addEventListener("click", fullScreen);
+  byId("full").hidden = !document.fullscreenEnabled;
+  for (const name of ["pointerdown", "wheel", "keydown"]) addEventListener(name, (event) => {
+    if (event.key !== "t" && !event.target.matches("#turn")) frames.stop();
+  }, { capture: true, passive: true });
   byId("about-run").addEventListener("click", () => byId("numbers").showModal());
   const background = byId("background");
   const behind = () => [1, 3, 5].map((start) => parseInt(background.value.slice(start, start + 2), 16) / 255);
@@ -468,8 +547,10 @@ async function start() {
     listenToKeys(frames);
     listenToControls(frames);
     frames.player.listen();
+    frames.marks.listen();
     document.body.classList.add("running");
-    frames.ask();
+    home(frames);
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) frames.turn(true);
   } catch (error) {
     if (!(error instanceof Refusal)) console.error(error);
     tell(error instanceof Refusal ? error.message : "This file is damaged: its scene cannot be read. Fetch it again.");

@@ -1,6 +1,6 @@
 // ---- A camera path: keyframes as nerf render path=keyframes reads them, in the capture's own frame ---------------
 
-const LEG = 2;  // seconds from a keyframe that is added to the one before
+const LEG = 2;  // seconds from a named view to the next
 const POINTS = ["position", "look_at", "up"];
 
 // The curve through values at increasing times that nerf render takes: cubic, Catmull and Rom's tangents.
@@ -21,7 +21,7 @@ function hermite(times, values, at) {
 
 class CameraPath {
   constructor(about) {
-    Object.assign(this, { given: about.path, own: [], film: about.film });
+    Object.assign(this, { given: about.path, marks: about.marks, film: about.film });
     const rows = about.to_user.slice(0, 3).map((row) => row.slice(0, 3));
     this.offset = about.to_user.slice(0, 3).map((row) => row[3]);
     this.scale = length(rows[0]);
@@ -29,29 +29,39 @@ class CameraPath {
     this.columns = [0, 1, 2].map((i) => this.rows.map((row) => row[i]));
   }
 
-  // What somebody recorded here, else what came with the page.
-  get keyframes() { return this.own.length ? this.own : this.given; }
+  // From one named view to the next, else what came with the page.
+  get keyframes() {
+    const { views } = this.marks;
+    return views.length > 1 ? views.map((view, i) => ({ ...view, time: LEG * i })) : this.given;
+  }
+
   get seconds() { return this.keyframes.length > 1 ? this.keyframes.at(-1).time : 0; }
 
   toUser(point) { return this.rows.map((row, i) => this.scale * dot(row, point) + this.offset[i]); }
   fromUser(point) { return this.columns.map((column) => dot(column, minus(point, this.offset)) / this.scale); }
 
-  add(view) {
+  // A camera as a keyframe file has it.
+  cameraOf(view) {
     const [width, height] = this.film;
     const tangent = 0.5 * view.lens.height / view.lens.focal[1] * width / height;
-    this.own.push({
+    return {
       position: this.toUser(view.eye), look_at: this.toUser(view.target), up: this.rows.map((row) => dot(row, view.axes[1])),
-      fov: 2 * Math.atan(tangent) * 180 / Math.PI, time: LEG * this.own.length,
-    });
+      fov: 2 * Math.atan(tangent) * 180 / Math.PI,
+    };
+  }
+
+  look(view, { position, look_at, up, fov }) {
+    const focal = this.film[0] / 2 / Math.tan(fov * Math.PI / 360);
+    const lens = { focal: [focal, focal], center: this.film.map((side) => side / 2), width: this.film[0], height: this.film[1] };
+    view.look(this.fromUser(position), this.fromUser(look_at), this.columns.map((column) => dot(column, up)), lens);
   }
 
   show(view, seconds) {
     const keys = this.keyframes, times = keys.map((key) => key.time);
     const along = (value) => hermite(times, keys.map(value), seconds);
-    const [eye, target, up] = POINTS.map((name) => along((key) => key[name]));
-    const focal = Math.exp(along((key) => [-Math.log(Math.tan(key.fov * Math.PI / 360))])[0]) * this.film[0] / 2;
-    const lens = { focal: [focal, focal], center: this.film.map((side) => side / 2), width: this.film[0], height: this.film[1] };
-    view.look(this.fromUser(eye), this.fromUser(target), this.columns.map((column) => dot(column, up)), lens);
+    const [position, look_at, up] = POINTS.map((name) => along((key) => key[name]));
+    const tangent = Math.exp(along((key) => [Math.log(Math.tan(key.fov * Math.PI / 360))])[0]);
+    this.look(view, { position, look_at, up, fov: 360 * Math.atan(tangent) / Math.PI });
   }
 
   yaml() {
@@ -68,36 +78,24 @@ class Player {
 
   listen() {
     const on = (id, name, what) => byId(id).addEventListener(name, what);
-    byId("path").addEventListener("submit", (event) => event.preventDefault());
     on("play", "click", () => this.toggle());
     on("time", "input", () => { this.pause(); this.to(Number(byId("time").value)); });
-    on("add", "click", () => this.add());
-    on("remove", "click", () => { this.path.own.pop(); this.changed(); });
-    on("save", "click", () => save("camera_path.yaml", this.path.yaml()));
-    this.changed();
+    on("save", "click", () => save("camera_path.yaml", new Blob([this.path.yaml()], { type: "text/yaml" })));
   }
 
-  add() {
-    this.pause();
-    this.path.add(this.frames.view);
-    this.changed();
-  }
-
-  // The time line after the keyframes have changed.
+  // The time line after the views have changed.
   changed() {
-    const { own, seconds } = this.path, time = byId("time");
-    if (!seconds) this.pause();
-    time.max = String(seconds || 1);
-    this.seconds = own.length ? seconds : 0;
-    time.value = String(this.seconds);
+    const { seconds } = this.path;
+    this.pause();
+    this.seconds = 0;
+    Object.assign(byId("time"), { max: String(seconds || 1), value: "0" });
     for (const id of ["play", "time", "save"]) byId(id).disabled = !seconds;
-    byId("remove").disabled = !own.length;
-    const count = own.length ? `${own.length} keyframe${own.length > 1 ? "s" : ""}, ` : "";
-    byId("length").value = own.length || seconds ? `${count}${seconds.toFixed(1)} s` : "no camera path yet";
+    byId("length").value = `${seconds.toFixed(1)} s`;
   }
 
   toggle() {
     this.playing = !this.playing && this.path.seconds > 0;
+    if (this.playing) this.frames.turn(false);
     this.began = performance.now() / 1000 - this.seconds;
     byId("play").textContent = this.playing ? "pause" : "play";
     this.frames.ask();
@@ -118,9 +116,9 @@ class Player {
   }
 }
 
-function save(name, text) {
+function save(name, blob) {
   const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([text], { type: "text/yaml" }));
+  link.href = URL.createObjectURL(blob);
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);

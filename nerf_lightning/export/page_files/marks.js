@@ -1,0 +1,137 @@
+// ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
+
+const ASKS = {
+  note: "Tap the place that the note is about, or press Enter for the middle.",
+  distance: "Tap the first point, or press Enter for the middle.",
+  second: "Tap the second point.",
+};
+
+class Marks {
+  constructor(frames) {
+    const { marks, metres } = frames.view.about;
+    Object.assign(this, { frames, lists: marks, metres, path: frames.player.path, asks: null, first: null, chosen: null, drawn: [] });
+  }
+
+  listen() {
+    const on = (id, what) => byId(id).addEventListener("click", what);
+    on("add-view", () => this.addView());
+    on("add-note", () => this.begin("note"));
+    on("measure", () => this.begin("distance"));
+    on("remove-mark", () => this.remove());
+    on("save-marks", () => save("views.json", new Blob([JSON.stringify(this.lists, null, 1)], { type: "application/json" })));
+    this.changed();
+  }
+
+  addView() {
+    const picture = document.querySelector("#photographs button[aria-pressed=true]");
+    const name = prompt("Name of this view", picture === null ? `view ${this.lists.views.length + 1}` : picture.title);
+    if (name) this.add("views", { name, ...this.path.cameraOf(this.frames.view) });
+  }
+
+  show(view) {
+    this.frames.stop();
+    this.path.look(this.frames.view, view);
+    this.frames.ask();
+  }
+
+  // A note or a distance: its points are tapped next.
+  begin(asks) {
+    this.asks = asks;
+    byId("told").textContent = ASKS[asks] ?? "";
+    document.body.classList.toggle("asking", asks !== null);
+  }
+
+  end() { this.begin(null); }
+
+  tap(x, y) {
+    if (this.asks === null) return;
+    const { view, picture } = this.frames, away = picture.depth(view, x, y);
+    picture.draw(view, 1);
+    if (!away) {
+      byId("told").textContent = "There is nothing here. Tap a surface.";
+      return;
+    }
+    const { focal, center } = lensIn(view.lens, innerWidth, innerHeight);
+    const ray = unit([(x - center[0]) / focal[0], (center[1] - y) / focal[1], -1]);
+    const point = this.path.toUser(view.axes.reduce((sum, axis, i) => plus(sum, axis, away * ray[i]), view.eye));
+    if (this.asks === "note") {
+      this.end();
+      const text = prompt("Note");
+      if (text) this.add("notes", { text, position: point });
+    } else if (this.asks === "distance") {
+      this.first = point;
+      this.begin("second");
+    } else {
+      this.end();
+      this.add("distances", { from: this.first, to: point });
+      byId("told").textContent = this.told(this.lists.distances.at(-1));
+    }
+  }
+
+  add(kind, mark) {
+    this.lists[kind].push(mark);
+    this.chosen = mark;
+    this.changed();
+  }
+
+  remove() {
+    for (const [kind, list] of Object.entries(this.lists)) this.lists[kind] = list.filter((mark) => mark !== this.chosen);
+    this.chosen = null;
+    this.changed();
+  }
+
+  told({ from, to }) {
+    const units = length(minus(to, from));
+    return this.metres === null ? `${units.toPrecision(3)} units` : `${(units * this.metres).toPrecision(3)} m`;
+  }
+
+  changed() {
+    const button = (mark, text, className, what) => {
+      const made = document.createElement("button");
+      Object.assign(made, { type: "button", textContent: text, className });
+      made.setAttribute("aria-pressed", String(mark === this.chosen));
+      made.addEventListener("click", () => {
+        this.chosen = mark;
+        this.changed();
+        what();
+      });
+      return made;
+    };
+    const { views, notes, distances } = this.lists;
+    byId("views").replaceChildren(...views.map((view) => button(view, view.name, "", () => this.show(view))));
+    const pins = [
+      ...notes.map((note) => [note, note.text, "note", [note.position]]),
+      ...distances.map((distance) => [distance, this.told(distance), "distance", [distance.from, distance.to]]),
+    ];
+    this.drawn = pins.map(([mark, text, name, points]) => {
+      const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
+      return { made: button(mark, text, name, () => {}), line, points: points.map((point) => this.path.fromUser(point)) };
+    });
+    byId("pins").replaceChildren(...this.drawn.map(({ made }) => made));
+    byId("lines").replaceChildren(...this.drawn.map(({ line }) => line));
+    byId("remove-mark").disabled = this.chosen === null;
+    byId("save-marks").disabled = !Object.values(this.lists).some((list) => list.length);
+    this.frames.player.changed();
+    this.frames.ask();
+  }
+
+  // Labels stand at their points; those of points behind a surface are pale, those behind the camera hidden.
+  place() {
+    const { view, picture } = this.frames, { focal, center } = lensIn(view.lens, innerWidth, innerHeight);
+    for (const { made, line, points } of this.drawn) {
+      const seen = points.map((point) => {
+        const [x, y, z] = view.axes.map((axis) => dot(axis, minus(point, view.eye)));
+        return z < 0 ? [center[0] - focal[0] * x / z, center[1] + focal[1] * y / z] : null;
+      });
+      made.hidden = seen.includes(null);
+      line.style.visibility = made.hidden ? "hidden" : "visible";
+      if (made.hidden) continue;
+      const [from, to] = [seen[0], seen.at(-1)], [x, y] = plus(from, to).map((each) => each / 2);
+      made.style.transform = `translate(${x}px, ${y}px)`;
+      for (const [name, at] of Object.entries({ x1: from[0], y1: from[1], x2: to[0], y2: to[1] })) line.setAttribute(name, at);
+      if (points.length > 1) continue;
+      const away = picture.depth(view, x, y);
+      made.classList.toggle("behind", away > 0 && away < 0.95 * length(minus(points[0], view.eye)));
+    }
+  }
+}
