@@ -40,6 +40,14 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert 'http-equiv="Content-Security-Policy" content="default-src &#x27;none&#x27;' in text
 
 
+def test_it_fits_a_phone(page_of_run):
+    with opened("about:blank") as driver:
+        phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
+        driver.get(page_of_run[0].as_uri())
+        assert driver.execute_script("return document.documentElement.scrollWidth") == 390
+
+
 def test_sliders_work_and_videos_play_in_a_browser(page_of_run):
     with opened(page_of_run[0].as_uri(), 1200, 900) as driver:
         run = driver.execute_script
