@@ -519,7 +519,7 @@ function listenToControls(frames) {
   byId("full").addEventListener("click", fullScreen);
   byId("full").hidden = !document.fullscreenEnabled;
   for (const name of ["pointerdown", "wheel", "keydown"]) addEventListener(name, (event) => {
-    if (event.key !== "t" && !event.target.matches("#turn")) frames.stop();
+    if (!event.target.matches("#turn, #play") && ![" ", "t", "T"].includes(event.key)) frames.stop();
   }, { capture: true, passive: true });
   byId("about-run").addEventListener("click", () => byId("numbers").showModal());
   const background = byId("background");
