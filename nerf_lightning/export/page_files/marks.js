@@ -39,9 +39,8 @@ class Marks {
     this.asks = asks;
     byId("told").textContent = ASKS[asks] ?? "";
     document.body.classList.toggle("asking", asks !== null);
+    byId("scene").focus();  // where Enter stands for the middle
   }
-
-  end() { this.begin(null); }
 
   tap(x, y) {
     if (this.asks === null) return;
@@ -55,14 +54,14 @@ class Marks {
     const ray = unit([(x - center[0]) / focal[0], (center[1] - y) / focal[1], -1]);
     const point = this.path.toUser(view.axes.reduce((sum, axis, i) => plus(sum, axis, away * ray[i]), view.eye));
     if (this.asks === "note") {
-      this.end();
+      this.begin(null);
       const text = prompt("Note");
       if (text) this.add("notes", { text, position: point });
     } else if (this.asks === "distance") {
       this.first = point;
       this.begin("second");
     } else {
-      this.end();
+      this.begin(null);
       this.add("distances", { from: this.first, to: point });
       byId("told").textContent = this.told(this.lists.distances.at(-1));
     }

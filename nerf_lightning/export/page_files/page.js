@@ -454,12 +454,13 @@ function listenToPointers(canvas, frames) {
 }
 
 function listenToKeys(frames) {
-  const held = (key) => key in FLIGHT || key in TURNS || key in ZOOMS;
+  const { marks } = frames, held = (key) => key in FLIGHT || key in TURNS || key in ZOOMS;
   const once = {
     1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
     b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => home(frames),
-    i: () => byId("numbers").showModal(), t: () => frames.turn(!frames.turning), f: fullScreen, p: () => savePicture(frames), v: () => frames.marks.addView(),
-    n: () => frames.marks.begin("note"), m: () => frames.marks.begin("distance"), escape: () => frames.marks.end(), enter: () => frames.marks.tap(innerWidth / 2, innerHeight / 2), delete: () => frames.marks.remove(),
+    i: () => byId("numbers").showModal(), t: () => frames.turn(!frames.turning), f: fullScreen, p: () => savePicture(frames),
+    v: () => marks.addView(), n: () => marks.begin("note"), m: () => marks.begin("distance"), escape: () => marks.begin(null),
+    enter: () => marks.tap(innerWidth / 2, innerHeight / 2), delete: () => marks.remove(), backspace: () => marks.remove(),
     " ": () => frames.player.toggle(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
