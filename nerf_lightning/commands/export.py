@@ -20,7 +20,8 @@ from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
-from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.results import scene_name
+from nerf_lightning.runs.summary import read_note, read_run
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
@@ -71,7 +72,8 @@ def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath |
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     keyframes = () if path is None else page_path(path, checkpoint.scene, run)
-    return PageExtras(photographs, corrected, tuple(known), keyframes)
+    name = scene_name({"scene": checkpoint.scene.name}, checkpoint.choices, read_run(run).overrides)
+    return PageExtras(photographs, corrected, tuple(known), keyframes, name)
 
 
 def page_path(path: CameraPath, record: SceneRecord, run: Path) -> Keyframes:

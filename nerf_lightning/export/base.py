@@ -23,6 +23,8 @@ class PageExtras:
     """What is known of the run: label and value, as texts that may come from anybody."""
     keyframes: tuple[dict[str, Any], ...] = ()
     """A camera path as a keyframe file has it, in the capture's own frame; each with all that a camera needs."""
+    name: str = ""
+    """What people call the scene; empty: as its record does."""
 
 
 class Export(ABC):

@@ -50,7 +50,7 @@ class PageExport(Export):
         max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
         fit_steps: so many steps move the bytes towards the photographs that the model learnt from; 0: they stay as
             baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
-        title: what the page is called; None: as the scene.
+        title: what the page is called; None: as the scene, or as its folder where it is named by its format alone.
         views: file of named views, notes and distances (`page_marks`), which is then kept as `views.json` next to the
             page; None: the one that lies there, if any.
         first_view: name of a view of that file, or of a photograph, with which the page begins; None: the training

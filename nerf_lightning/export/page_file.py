@@ -103,7 +103,7 @@ def write_page(
     cameras = at_most(record.cameras, STILL)
     rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, first))[0]
     page = {
-        "title": title or record.name,
+        "title": title or beside.name or record.name,
         "facts": [("scene", record.name), *beside.facts, *facts, ("grid", grid)],
         "views": [_view(record, beside, view if max_photographs else None) for view in views],
         "still": _jpeg(over(marcher.render(rays), record.background), STILL),

@@ -19,7 +19,9 @@ from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.embedding import embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import Report
+from nerf_lightning.runs.results import scene_name
 from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.summary import read_run as read_summary
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
@@ -129,6 +131,8 @@ def _add_coverage(report: Report, run: Path) -> None:
     checkpoint = newest_checkpoint(run / "checkpoints")
     if checkpoint is None:
         raise InputError(f"{run} has no checkpoint")
-    report.title = f"{checkpoint.scene.name}, {len(checkpoint.scene.view_names)} photographs"
+    record = checkpoint.scene
+    name = scene_name({"scene": record.name}, checkpoint.choices, read_summary(run).overrides)
+    report.title = f"{name}, {len(record.view_names)} photographs"
     report.subtitle = f"{checkpoint.choices.get('model', '')}, {report.subtitle}"
-    report.coverage = embedded(coverage_picture(checkpoint.scene).numpy())
+    report.coverage = embedded(coverage_picture(record).numpy())

@@ -124,7 +124,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     settings = {k: v for k, v in run.overrides.items() if meaning_of(k.lstrip("+~").partition("@")[0]).shown}
     return RunResult(
         summary=run,
-        scene=_scene_name(protocol, origin, run.overrides),
+        scene=scene_name(protocol, origin, run.overrides),
         model=str(origin.get("model") or run.overrides.get("model", "")) or "not said",
         seed=int(seed) if SEED.fullmatch(seed) else None,
         values=values,
@@ -134,7 +134,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     )
 
 
-def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
+def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
     """Return the scene's name; where it bears its format's alone, that of the folder or file it was read from."""
     name = str(protocol.get("scene", "")) or "not said"
     if name != str(origin.get("scene", overrides.get("scene"))):
