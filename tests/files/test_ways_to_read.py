@@ -22,7 +22,6 @@ OURS = {
     "export/page_file.py": ["read_text"],
     "messages/console.py": ["print"],
     "training/loggers.py": ["open"],
-    "viewer/film.py": ["read_bytes"],
     "runs/sweep.py": ["print"],
     "evaluation/protocol.py": ["read_text"],
     "training/launch/processes.py": ["open", "read_text"],
