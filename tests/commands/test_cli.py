@@ -103,6 +103,7 @@ def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
 def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypatch, command, key):
     monkeypatch.chdir(tmp_path)
     said(nerf(command), f"nerf {command} needs a run, and outputs/ holds none")
+    said(nerf(command, "paths.root_dir=elsewhere"), f"nerf {command} needs a run, and elsewhere/ holds none")
     for age, run in enumerate(["outputs/sweeps/new/0_seed=0", "outputs/bricks/old"]):
         (tmp_path / run / "checkpoints").mkdir(parents=True)
         (tmp_path / run / "checkpoints" / "last.ckpt").touch()

@@ -31,7 +31,6 @@ OURS = {
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "files/html.py": ["read_text"],
     "runs/published.py": ["read_text"],
-    "selftest/command_line.py": ["read_text"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_text"],
     "cli/worker.py": ["load", "load"],
