@@ -27,6 +27,7 @@ OURS = {
     "training/launch/processes.py": ["open", "read_text"],
     "config/scene_overrides.py": ["read_text"],
     "config/exporters.py": ["read_text"],
+    "data/readers/auto.py": ["read_text"],
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "files/html.py": ["read_text"],

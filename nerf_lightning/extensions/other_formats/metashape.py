@@ -57,6 +57,8 @@ class MetashapeReader(CaptureReader):
         file: the xml below root; null: the only one there.
     """
 
+    named_by = (".xml",)
+
     name: str = "metashape"
     file: str | None = None
 
