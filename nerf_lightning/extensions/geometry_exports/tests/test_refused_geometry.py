@@ -1,4 +1,4 @@
-"""What no exporter does: settings that make no sense, missing libraries, frames and disks that it cannot use."""
+"""What these exporters refuse: settings that make no sense, missing libraries, frames and disks that it cannot use."""
 
 import sys
 from dataclasses import replace
@@ -10,13 +10,10 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.cameras import CamerasExport
-from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.export.mesh import MeshExport
-from nerf_lightning.export.page import PageExport
-from nerf_lightning.export.points import PointsExport
-from nerf_lightning.export.volume import VolumeExport
 from nerf_lightning.export.voxel_kernels import layout
+from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
+from nerf_lightning.extensions.geometry_exports.points import PointsExport
+from nerf_lightning.extensions.geometry_exports.volume import VolumeExport
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 
@@ -39,9 +36,6 @@ def exported(folder, what, **changes):
         (MeshExport, {"surface": "tsdf", "seen_only": False}, "what.seen_only=false asks for a closed mesh"),
         (MeshExport, {"texture": True, "format": "ply"}, "what.format=ply has no texture"),
         (PointsExport, {"agreement": 9}, "what.agreement=9"),
-        (ImagesExport, {"max_views": 0}, "what.max_views=0"),
-        (CamerasExport, {"fps": 0}, "what.fps=0"),
-        (PageExport, {"resolution": 4}, "what.resolution=4: give 8 voxels or more"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(exporter, settings, said):

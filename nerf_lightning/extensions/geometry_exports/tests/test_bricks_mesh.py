@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from support.bricks_surface import distances, exact_surface, on_mesh
+from bricks_surface import distances, exact_surface, on_mesh
 from support.running import start
 
 POINTS = 100_000

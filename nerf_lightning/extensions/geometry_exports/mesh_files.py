@@ -12,7 +12,7 @@ from PIL import Image
 
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.errors import require_extra
-from nerf_lightning.nerf.geometry.frames import upright_rotation
+from nerf_lightning.nerf.geometry.frames import y_up
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
 MeshFormat = Literal["ply", "obj", "glb"]
@@ -35,7 +35,7 @@ class GltfFrame:
     def __call__(self, tree: dict[str, Any]) -> None:
         """Place the root node, and let no viewer add light of its own: it is in the colours already."""
         (root,) = tree["scenes"][tree["scene"]]["nodes"]
-        placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(self.up)
+        placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(torch.from_numpy(self.up)).numpy()
         tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
         rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
@@ -105,17 +105,6 @@ def save_textured_mesh(
         with whole_file(each) as part:
             part.write_bytes(content)
     return list(contents)
-
-
-def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
-    """Return the rotation that takes `up` to +y, and what a frame with z up calls x to x.
-
-    >>> (y_up(np.array([0.0, 0.0, 1.0])) @ [1, 2, 3, 1]).tolist()
-    [1.0, 3.0, -2.0, 1.0]
-    """
-    turned = np.eye(4)
-    turned[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright_rotation(torch.from_numpy(up)).numpy()
-    return turned
 
 
 def require_library(name: str, extra: str = "mesh") -> Any:

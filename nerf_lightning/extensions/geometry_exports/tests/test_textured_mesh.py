@@ -12,8 +12,8 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.mesh import MeshExport
-from nerf_lightning.export.voxel_kernels.texels import covered_texels
+from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
+from nerf_lightning.extensions.geometry_exports.texels import covered_texels
 from nerf_lightning.messages.errors import InputError
 
 TILE, CELL = 1 << 15, 0.5

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nerf_lightning.export.density_grid import Lattice
-from nerf_lightning.export.density_mesh import marching_cubes
-from nerf_lightning.export.voxel_kernels.tsdf_fusion import add_view
+from nerf_lightning.extensions.geometry_exports.density_mesh import marching_cubes
+from nerf_lightning.extensions.geometry_exports.tsdf_fusion import add_view
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.poses import look_at
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.export.base import Export, require_free, require_setting
-from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.visibility import nearest_views, num_agreeing, see
+from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError

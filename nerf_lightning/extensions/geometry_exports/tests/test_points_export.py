@@ -13,8 +13,14 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
-from nerf_lightning.export.points import BYTES_PER_PIXEL, BYTES_PER_POINT, PointsExport, save_las, scale_and_offset
 from nerf_lightning.export.visibility import num_agreeing, see
+from nerf_lightning.extensions.geometry_exports.points import (
+    BYTES_PER_PIXEL,
+    BYTES_PER_POINT,
+    PointsExport,
+    save_las,
+    scale_and_offset,
+)
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
 

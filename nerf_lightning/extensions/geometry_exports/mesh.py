@@ -11,14 +11,21 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export import density_mesh, fused_mesh
 from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
-from nerf_lightning.export.density_mesh import mesh_of_density, without_floaters
-from nerf_lightning.export.fused_mesh import mesh_of_depth
-from nerf_lightning.export.mesh_files import GltfFrame, MeshFormat, require_library, save_mesh, save_textured_mesh
-from nerf_lightning.export.surface import SeenFrom, surface_colors
-from nerf_lightning.export.texture import (
+from nerf_lightning.export.visibility import seen_faces
+from nerf_lightning.extensions.geometry_exports import density_mesh, fused_mesh
+from nerf_lightning.extensions.geometry_exports.density_mesh import mesh_of_density, without_floaters
+from nerf_lightning.extensions.geometry_exports.fused_mesh import mesh_of_depth
+from nerf_lightning.extensions.geometry_exports.mesh_files import (
+    GltfFrame,
+    MeshFormat,
+    require_library,
+    save_mesh,
+    save_textured_mesh,
+)
+from nerf_lightning.extensions.geometry_exports.surface import SeenFrom, surface_colors
+from nerf_lightning.extensions.geometry_exports.texture import (
     LARGEST_SIZE,
     LEAST_SIZE,
     TextureMaker,
@@ -26,8 +33,6 @@ from nerf_lightning.export.texture import (
     make_atlas,
     require_texture_room,
 )
-from nerf_lightning.export.visibility import seen_faces
-from nerf_lightning.export.voxel_kernels.layout import ROOM
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
@@ -70,7 +75,7 @@ class MeshExport(Export):
             PNG beside it.
     """
 
-    kernels = (f"{ROOM}.tsdf_fusion", f"{ROOM}.texels")
+    kernels = (f"{__package__}.tsdf_fusion", f"{__package__}.texels")
 
     resolution: int = 256
     surface: Surface = "density"

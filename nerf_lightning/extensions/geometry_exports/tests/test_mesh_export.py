@@ -15,9 +15,9 @@ from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.density_mesh import without_floaters
-from nerf_lightning.export.fused_mesh import depth_rays
-from nerf_lightning.export.mesh import MeshExport
+from nerf_lightning.extensions.geometry_exports.density_mesh import without_floaters
+from nerf_lightning.extensions.geometry_exports.fused_mesh import depth_rays
+from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.frames import similarity, unit_of, upright_rotation
@@ -277,3 +277,11 @@ def test_what_no_view_sees_is_refused_with_the_cure(tmp_path):
     with pytest.raises(InputError, match=r"no training view of ball sees anything opaque in its box"):
         fused(tmp_path, solid(ball()), elsewhere)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("metres", "size"), [(0.01, 0.8), (None, 80.0)])
+def test_a_glb_has_its_size_in_metres_where_the_unit_is_known(tmp_path, metres, size):
+    to_user = similarity(torch.eye(3), torch.tensor([5.0, 6.0, 7.0]), 50.0)
+    record = replace(scene_record(ball_scene(num_views=4, size=33)), to_user=to_user, metres_per_unit=metres)
+    MeshExport(resolution=16, format="glb").export(solid(ball()), record, tmp_path, 1 << 15)
+    assert trimesh.load(tmp_path / "mesh.glb").extents == pytest.approx(np.full(3, size), rel=0.1)

@@ -12,8 +12,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from nerf_lightning.export.density_grid import Lattice, Report, sample_density
-from nerf_lightning.export.mesh_files import require_library
-from nerf_lightning.export.surface import surface_level
+from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
+from nerf_lightning.extensions.geometry_exports.surface import surface_level
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerf_lightning.export.base import Export, refuse_ndc, require_free
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
-from nerf_lightning.export.surface import looks_from_nearest
+from nerf_lightning.extensions.geometry_exports.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StageProgress
