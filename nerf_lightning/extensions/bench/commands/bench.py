@@ -18,18 +18,18 @@ from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
-from nerf_lightning.bench.kernels import compared_kernels
-from nerf_lightning.bench.prepared import Bench, prepare
-from nerf_lightning.bench.stages import (
+from nerf_lightning.compute.cores import num_cores
+from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.extensions.bench.kernels import compared_kernels
+from nerf_lightning.extensions.bench.prepared import Bench, prepare
+from nerf_lightning.extensions.bench.stages import (
     MATRIX_FLOPS,
     LoadedSteps,
     flops_per_ray,
     multiplication,
     stage_seconds,
 )
-from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
-from nerf_lightning.config.instantiate import build
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
