@@ -6,9 +6,10 @@ from support.budget import budget
 from support.planted import write_checkpoint
 from support.running import refused
 
-from nerf_lightning.checkpoints.quantization import dequantized, quantize_rows, quantize_switches
+from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.extensions.pruning.quantize import quantize_rows, quantize_switches
 
 STARTS = (0, 40, 100)
 
