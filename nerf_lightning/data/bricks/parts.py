@@ -84,7 +84,9 @@ def _between(low: Triple, high: Triple) -> tuple[Triple, Triple]:
 
 RED = Material((0.86, 0.10, 0.08))
 WHITE = Material((0.94, 0.94, 0.92))
+YELLOW = Material((0.99, 0.79, 0.08))
 BLUE = Material((0.05, 0.35, 0.92), specular=0.6, sharpness=6, mirror=0.06)
+SKIN = Material((0.98, 0.82, 0.20))
 GREY = Material((0.62, 0.64, 0.66))
 DARK = Material((0.20, 0.21, 0.23))
 BLACK = Material((0.10, 0.10, 0.11), specular=0.12, sharpness=3, mirror=0.02)
