@@ -41,6 +41,10 @@ def same_rays(one, other, names):
         torch.testing.assert_close(my_directions, their_directions, atol=1e-4, rtol=0)
 
 
+def known_turned(**changes):
+    return Known(**changes).moved(120.0, ROTATION, np.array([900.0, 20.0, -70.0]))
+
+
 @pytest.mark.parametrize("camera", LENSES)
 def test_round_trip_through_both_formats(tmp_path, camera):
     known = known_turned(camera=camera, params=LENSES[camera])
