@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for, cpu_backend
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Word = TypeVar("Word", int, Tensor)
@@ -67,7 +67,7 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
-        kernels = cpu_backend("random.cpu", self.slots.device) if self.slots.dim() == 1 else None
+        kernels = backend_for("random", self.slots.device) if self.slots.dim() == 1 else None
         if kernels is not None:
             return kernels.uniform(self.key, self.slots, purpose_word(purpose), count)
         return self.along(count).uniform(purpose)

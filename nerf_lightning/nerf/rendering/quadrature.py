@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate_dense
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
@@ -53,6 +54,18 @@ def composite(
         rays: where near and far stand.
         background: colour behind each ray; None closes the ray instead.
     """
+    integrated = integrate_dense(output.density, output.rgb, samples.edges, closed=background is None)
+    if integrated is not None and not output.channels:
+        foreground, opacity, depth, weights = integrated
+        escaped = 1.0 - opacity
+        return DenseRendering(
+            rgb=foreground if background is None else foreground + escaped[..., None] * background,
+            foreground=foreground,
+            opacity=opacity,
+            depth=depth if background is None else depth + escaped * rays.far,
+            weights=weights,
+            samples=samples,
+        )
     weights = weights_from_density(output.density, samples.deltas)
     if background is None:
         weights = closed_weights(weights)

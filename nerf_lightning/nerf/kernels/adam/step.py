@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for
 
 
 def adam_step(
@@ -30,7 +30,7 @@ def adam_step(
         eps: keeps the quotient finite.
     """
     arrays = (parameter.detach(), grad, first, second)
-    backend = cpu_backend("adam.cpu", parameter.device)
+    backend = backend_for("adam", parameter.device)
     if backend is not None and all(x.is_contiguous() and x.dtype == torch.float32 for x in arrays):
         backend.adam_step(*arrays, step_size, root_scale, betas, eps)
     else:

@@ -30,6 +30,8 @@ PROGRAMS = 256
 """So many sum up the gradients of the weights, each for itself: the order of sums, and so their bits, are fixed."""
 NARROWEST, WIDEST = 16, 128
 LAYERS = (2, 3)
+INTERPRETED = triton.knobs.runtime.interpret
+"""Triton's interpreter multiplies no bfloat16 numbers."""
 
 
 @functools.cache
@@ -65,7 +67,7 @@ def forward(
     if rows:
         arrays = points.contiguous(), _packed(weights, widths), out, kept
         sizes = points.shape[1], out.shape[1], *widths, widths[-1]
-        flags = len(weights), keep, BLOCK, _interpreted(out)
+        flags = len(weights), keep, BLOCK, INTERPRETED
         _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *sizes[:6], *flags, **FORWARD)
     return out, kept
 
@@ -82,7 +84,7 @@ def backward(
     if rows:
         arrays = grad.contiguous(), _packed(weights, widths), kept, of_points, sums
         sizes = inputs, grad.shape[1], *widths, widths[-1]
-        flags = len(weights), wants_points, BACKWARD_BLOCK, _interpreted(sums)
+        flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
         _backward[(programs,)](*arrays, rows, *sizes[:6], *flags, **BACKWARD)
     total, grads, offset = sums.sum(dim=0), [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
@@ -123,11 +125,6 @@ def _packed(weights: Sequence[Tensor], widths: Sequence[int]) -> BFloat16[Tensor
         for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True)
     ]
     return torch.cat(padded).bfloat16()
-
-
-def _interpreted(tensor: Tensor) -> bool:
-    """Tell whether triton's interpreter runs, which multiplies no bfloat16 numbers."""
-    return not tensor.is_cuda
 
 
 @triton.jit
