@@ -6,11 +6,11 @@ from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel, render_whole_rays
+from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel, render_samples, render_whole_rays
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.ragged import composite_ragged, ragged_rendering
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler, Sampler
 from nerf_lightning.nerf.samplers.early_termination import LEAST_ALPHA, render_until_opaque, visible_samples
@@ -51,6 +51,11 @@ class RaggedLevel(Level):
         capacity = self.sampler.capacity_for(rays)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         self.counter.add(samples.found, rays.near.shape[0], torch.zeros_like(samples.found) + dropped)
+        on_cuda = samples.starts.is_cuda and torch.is_grad_enabled()
+        parts = self.field.parts() if on_cuda else None
+        integrated = render_samples(rays, samples, parts, self.field.matmul_precision)
+        if integrated is not None:
+            return ragged_rendering(integrated, samples, rays, background)
         output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
         return composite_ragged(output, samples, rays, background)
 
