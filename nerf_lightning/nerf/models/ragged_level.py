@@ -49,8 +49,9 @@ class RaggedLevel(Level):
             return render_until_opaque(self.sampler, self.field, rays, background)
         samples, features = visible_samples(self.sampler, self.field, rays, random)
         capacity = self.sampler.capacity_for(rays)
-        dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
-        self.counter.add(samples.found, rays.near.shape[0], torch.zeros_like(samples.found) + dropped)
+        found = samples.found
+        dropped = torch.zeros_like(found) if capacity is None else (found - capacity).clamp(min=0)
+        self.counter.add(found, rays.near.shape[0], dropped)
         on_cuda = samples.starts.is_cuda and torch.is_grad_enabled()
         parts = self.field.parts() if on_cuda else None
         integrated = render_samples(rays, samples, parts, self.field.matmul_precision)
