@@ -78,8 +78,10 @@ def backward(
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
     programs = max(1, min(PROGRAMS, triton.cdiv(rows, BACKWARD_BLOCK)))
-    sums = of_points.new_zeros(programs, sum(a * b for a, b in pairwise(widths)))
-    if rows:
+    sums = of_points.new_empty(programs, sum(a * b for a, b in pairwise(widths)))
+    if not rows:
+        sums.zero_()
+    else:
         arrays = grad.contiguous(), *_three(weights), kept, of_points, sums
         flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
         _backward[(programs,)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)

@@ -17,7 +17,7 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 
-LEARNING, RENDERING, DENSE = "render.gradients", "render.cpu", "render.dense"
+LEARNING, RENDERING, DENSE, SAMPLES = "render.gradients", "render.cpu", "render.dense", "render.cuda"
 
 
 class WholeRays(NamedTuple):
@@ -69,13 +69,20 @@ def render_samples(
     None where there are no such kernels, or other gradients are wanted. The other arguments are those of
     `render_dense_rays`.
     """
-    kernels: Any = cuda_backend("render.cuda", rays.near.device)
-    if kernels is None or field is None or field.ray_features_learn or rays.near.dim() != 1:
+    if field is None or not takes_samples(rays, field):
         return None
+    kernels: Any = cuda_backend(SAMPLES, rays.near.device)
+    return kernels.render(rays, samples, field, matmul_precision, closed, whole_from)
+
+
+def takes_samples(rays: RayBundle, field: FieldParts | None) -> bool:
+    """Return whether `render_samples` renders samples on these rays."""
+    if field is None or field.ray_features_learn or rays.near.dim() != 1:
+        return False
     numbers = (rays.origins, rays.directions, field.table, *field.density_weights, *field.color_weights)
     if any(each.dtype != torch.float32 for each in numbers) or any(each.requires_grad for each in numbers[:2]):
-        return None
-    return kernels.render(rays, samples, field, matmul_precision, closed, whole_from)
+        return False
+    return cuda_backend(SAMPLES, rays.near.device) is not None
 
 
 def _has(module: str, field: FieldParts, matmul_precision: MatmulPrecision, device: torch.device) -> bool:
