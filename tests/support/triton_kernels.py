@@ -6,7 +6,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import torch
-from support.triton_batches import check_pixels, check_rays  # noqa: F401: check_all finds them by name
+from support.triton_batches import check_pixels, check_rays  # noqa: F401 -- check_all finds them by name
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder

@@ -1,4 +1,4 @@
-"""Adam's step for CUDA, of all parameters in one launch and one pass over memory. `TRITON_INTERPRET=1` runs the kernel without a GPU."""
+"""Adam's step for CUDA: all parameters by one launch, in one pass. `TRITON_INTERPRET=1` runs it without a GPU."""
 
 import functools
 from collections.abc import Sequence
