@@ -6,7 +6,6 @@ import torch
 
 from nerf_lightning.data.ray_batches import PixelDomain, gather_batch
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
-from nerf_lightning.nerf.geometry.lenses import NEWTON_STEPS
 from nerf_lightning.nerf.kernels.rays.cuda import LENSES
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
@@ -51,7 +50,7 @@ def check_rays(kernels, device, generator, rays):
             pixels = PixelIndex(view, x, y)
             expected = rays_through_pixels(double, pixels, near, 2 * near, None, 2)
             given = (each.to(device) for each in (cameras, pixels, near, 2 * near))
-            found = kernels.rays_through_pixels(*given, 2, NEWTON_STEPS)
+            found = kernels.rays_through_pixels(*given, 2)
             for one, other in zip(found.tensors(), expected.tensors(), strict=True):
                 torch.testing.assert_close(one.cpu().double(), other.double(), rtol=2e-6, atol=1e-6)
     for wants in (cameras.c2w, cameras.lens):
