@@ -64,11 +64,12 @@ def trial(device: str = "cuda") -> None:
     Raises:
         RuntimeError: they compute wrongly.
     """
-    zero, one, four = (torch.tensor([number], device=device) for number in (0, 1, 4))
-    view, x, y = locate(3 * one, four, 2 * one, zero, zero, zero)  # the last pixel of a picture of 2 x 2
-    rgba = 51 * torch.arange(16, device=device).view(4, 4).to(torch.uint8).clamp(max=5)
-    colors, weight = gather(view, x, y, zero, 2 * one, rgba, None)
-    if (int(x), int(y)) != (1, 1) or not bool((colors == 1.0).all()) or float(weight) != 1.0:
+    ends, views = torch.tensor([[4, 8], [0, 1]], device=device)  # two pictures of 2 x 2
+    view, x, y = locate(ends - 1, ends, 0 * views + 2, views, 0 * views, 0 * views)  # their last pixels
+    rgba = torch.arange(32, device=device).clamp(max=15).view(8, 4).to(torch.uint8)
+    colors, weight = gather(view, x, y, ends - 4, 0 * views + 2, 17 * rgba, None)
+    found = view.tolist(), x.tolist(), y.tolist(), colors[1].tolist(), weight.tolist()
+    if found != ([0, 1], [1, 1], [1, 1], [1.0] * 4, [1.0, 1.0]):
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 

@@ -62,9 +62,9 @@ def trial(device: str = "cuda") -> None:
     Raises:
         RuntimeError: it computes wrongly.
     """
-    one, zero = torch.ones(1, device=device), torch.zeros(1, dtype=torch.int64, device=device)
-    lens, size, c2w = torch.zeros(1, 6, device=device), zero + 1, torch.eye(3, 4, device=device)[None]
-    given = c2w, one.expand(1, 2), 0.5 * one.expand(1, 2), lens
+    one, zero = torch.ones(2, device=device), torch.zeros(2, dtype=torch.int64, device=device)
+    lens, size, c2w = torch.zeros(2, 6, device=device), zero + 1, torch.eye(3, 4, device=device).expand(2, 3, 4)
+    given = c2w, one.expand(2, 2), 0.5 * one.expand(2, 2), lens
     pixel = PixelIndex(zero, zero, zero)
     # Along the axis.
     found = [rays_through_pixels(Cameras(*given, model, size, size), pixel, one, 2 * one, 1) for model in LENSES]
