@@ -38,8 +38,11 @@ class StepGuard:
         self.watched = [*watched, "loss.itself"]
         if finite.device.type == "cpu":
             return bool(finite)
-        # The bits times 1 or 0: of NaN nothing is left either.
-        torch._foreach_mul_([gradient.view(torch.int32) for gradient in gradients.values()], finite)
+        if finite.is_cuda:  # all at once: the bits times 1 or 0, since NaN times 0 is NaN
+            torch._foreach_mul_([gradient.view(torch.int32) for gradient in gradients.values()], finite)
+        else:
+            for gradient in gradients.values():
+                gradient.masked_fill_(bad.bool(), 0.0)
         return True
 
     @property

@@ -35,9 +35,10 @@ def test_on_the_cpu_steps_are_left_out_and_counted():
     assert guard.first_module == "part2"
 
 
-def test_elsewhere_their_gradients_become_zeros_and_others_keep_their_bits():
+@pytest.mark.parametrize("kind", ["cuda", "mps"])
+def test_elsewhere_their_gradients_become_zeros_and_others_keep_their_bits(kind):
     guard = StepGuard()
-    with StandInDevice("cuda") as there:
+    with StandInDevice(kind) as there:
         seen = list(steps_taken(guard, there.device))
         assert guard.state() == [3, 1]
         assert guard.first_module == "part2"
