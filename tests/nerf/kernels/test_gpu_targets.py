@@ -94,7 +94,8 @@ def test_small_kernels_compile_and_keep_all_in_registers(name, monkeypatch):
     for module, names in SMALL.items():
         kernels = importlib.import_module(f"{backends.KERNELS}.{module}")
         launched = {ragged: SMALL["ragged.cuda"], kernels: names}  # quadrature ends the trial of rendering
-        with compiled_for(name, launched) as made, forced(), contextlib.suppress(RuntimeError):  # nothing is computed
+        # Nothing is computed, of which a trial complains, or torch that a number with gradients is read.
+        with compiled_for(name, launched) as made, forced(), contextlib.suppress(RuntimeError, UserWarning):
             kernels.trial("cpu")
         assert {kernel.metadata.name for kernel in made.kernels} >= set(names)
         assert made.spilled() == 0, module
