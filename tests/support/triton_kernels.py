@@ -29,8 +29,8 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 SMALL = [name for name in backends.CUDA_BACKENDS if name not in ("hash_grid.cuda", "mlp.cuda")]
 
 
-def check_all(device, generator, rays=70):
-    for name in SMALL:
+def check_all(device, generator, rays=70, names=SMALL):
+    for name in names:
         kernels = importlib.import_module(f"{backends.KERNELS}.{name}")
         with forced():
             kernels.trial(device)

@@ -162,6 +162,11 @@ from support.triton_perceptron import check_perceptron
 cuda.PROGRAMS = 2  # so that one takes several blocks
 check_perceptron("cpu", [0, 1, 640])
 """,
+    "batches": """
+import torch
+from support.triton_kernels import check_all
+check_all("cpu", torch.Generator().manual_seed(0), names=("adam.cuda", "pixels.cuda", "rays.cuda"))
+""",
     "others": """
 import torch
 from support.triton_kernels import check_all
@@ -170,7 +175,9 @@ check_all("cpu", torch.Generator().manual_seed(0))
 }
 
 
-@pytest.mark.parametrize("kernel", CHECKS)
+@pytest.mark.parametrize(
+    "kernel", [pytest.param(name, marks=[pytest.mark.minutes] * (name == "others")) for name in CHECKS]
+)
 def test_through_the_interpreter(kernel):
     pytest.importorskip("triton", reason="triton is not installed (Linux only)")
     # The interpreter is chosen when the kernels are defined: a process of its own.
