@@ -26,7 +26,7 @@ QUALITIES: tuple[Quality, ...] = get_args(Quality)
 RESOLUTIONS: dict[Space, dict[Quality, int]] = {
     "bounded": {"small": 128, "medium": 216, "large": 320},
     "ndc": {"small": 128, "medium": 216, "large": 320},
-    "contracted": {"small": 108, "medium": 128, "large": 192},
+    "contracted": {"small": 108, "medium": 160, "large": 192},
 }
 # and spherical harmonics of its colours: without bounds much is fog, which hides less what changes with the direction.
 HARMONICS: dict[Space, dict[Quality, int]] = {

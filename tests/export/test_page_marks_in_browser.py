@@ -29,7 +29,7 @@ def page(tmp_path_factory):
     folder, scene = tmp_path_factory.mktemp("page"), all_around()
     content = {
         "views": [{"name": EVIL, "photograph": "ball_2"}],
-        "notes": [{"text": EVIL, "position": [5.0, 0.0, 3 * RADIUS]}],
+        "notes": [{"text": EVIL, "position": [5.0 + 3 * RADIUS, 0.0, 0.0]}],
     }
     (folder / "given.json").write_text(json.dumps(content))
     chosen = {"views": str(folder / "given.json"), "first_view": EVIL, "title": EVIL}

@@ -42,10 +42,12 @@ def marched(page, view: int, width: int, height: int, behind="white") -> np.ndar
 
 
 def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
-    scale = min(width / size[0], height / size[1])
+    about, baked = read_baked(page)
+    small, large = sorted((width / size[0], height / size[1]))
+    scale = small * (large / small) ** (1 / 3 if about["contraction"] else 0)
     cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
     rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), all_pixels(cameras, 0))
-    return over(Marcher(read_baked(page)[1]).render(rays), behind).clamp(0, 1).numpy()
+    return over(Marcher(baked).render(rays), behind).clamp(0, 1).numpy()
 
 
 def psnr(one, other) -> float:

@@ -119,9 +119,11 @@ function atlasOf(blocks, most) {
 
 // ---- The picture -------------------------------------------------------------------------------------------------
 
-// Focal length and principal point of a lens that fits into a window, its middle in the window's.
-function lensIn(lens, width, height) {
-  const scale = Math.min(width / lens.width, height / lens.height), middle = [width / 2, height / 2];
+// Focal length and principal point of a view's lens, whose picture fits into the window, its middle in the window's. Of
+// scenes without bounds, where nothing is known beyond the photographs' edges, it fills a part of what would stay empty.
+function lensIn({ lens, about }, width, height) {
+  const fits = [width / lens.width, height / lens.height], least = Math.min(...fits), middle = [width / 2, height / 2];
+  const scale = about.contraction ? least * Math.cbrt(Math.max(...fits) / least) : least;
   const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
   return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
 }
@@ -217,12 +219,12 @@ class Picture {
     const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    this.trace(view, lensIn(view.lens, width, height), width, height, view.shown);
+    this.trace(view, lensIn(view, width, height), width, height, view.shown);
   }
 
   // How far away the surface is at a place of the window (in pixels of CSS), along the ray; 0: there is none.
   depth(view, x, y) {
-    const gl = this.gl, bytes = new Uint8Array(4), { focal, center } = lensIn(view.lens, innerWidth, innerHeight);
+    const gl = this.gl, bytes = new Uint8Array(4), { focal, center } = lensIn(view, innerWidth, innerHeight);
     this.trace(view, { focal, center: [center[0] - x + 0.5, center[1] - y + 0.5] }, 1, 1, 3);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     return new Float32Array(new Uint8Array([0, ...bytes.slice(0, 3)]).buffer)[0];
@@ -320,7 +322,7 @@ const TURN = 24;  // seconds for once around, or to and fro
 class Frames {
   constructor(picture, view) {
     Object.assign(this, { picture, view, share: 0.6, movedAt: -Infinity, before: 0, waits: false, keys: new Set() });
-    Object.assign(this, { turning: false, turned: 0 });
+    Object.assign(this, { turning: false, turned: 0, drawing: false });
     this.player = new Player(this);
     this.marks = new Marks(this);
     this.step = this.step.bind(this);
@@ -369,11 +371,14 @@ class Frames {
     place(this.view);
     this.marks.place();
     if (this.keys.size || this.player.playing || this.turning || performance.now() - this.movedAt < PAUSE) {
-      if (elapsed > SLOW && elapsed < 1000) this.share = Math.max(COARSEST, 0.85 * this.share);
+      // Pixels take the time, and the first frame after a pause tells nothing of it.
+      if (this.drawing && elapsed > SLOW) this.share = Math.max(COARSEST, this.share * Math.max(0.5, Math.sqrt(SLOW / elapsed)));
       if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
+      this.drawing = true;
       this.picture.draw(this.view, this.share);
       this.ask();
     } else {
+      this.drawing = false;
       this.picture.draw(this.view, 1);
       document.body.dataset.state = "still";
     }
@@ -402,7 +407,7 @@ function place(view) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
   if (!source) return;
-  const { scale } = lensIn(view.lens, innerWidth, innerHeight);
+  const { scale } = lensIn(view, innerWidth, innerHeight);
   const [width, height] = [scale * view.lens.width, scale * view.lens.height];
   Object.assign(photograph.style, { width: `${width}px`, height: `${height}px`, left: `${(innerWidth - width) / 2}px`, top: `${(innerHeight - height) / 2}px` });
   photograph.style.setProperty("--at", `${byId("wipe").value}%`);
