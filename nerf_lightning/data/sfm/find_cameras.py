@@ -9,6 +9,7 @@ from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
 from nerf_lightning.data.sfm.reconstruction import (
     NothingFoundError,
     SparseModel,
+    cause_of_nothing,
     in_short,
     reconstruct,
     require_pycolmap,
@@ -54,10 +55,12 @@ def find_cameras(
         if placed and number + 1 < len(tried):
             log.info("cameras: %d of %d placed; next try: %s", placed, len(photographs), tried[number + 1])
     if not best:
+        cause = cause_of_nothing(work, tried[0])
         raise NothingFoundError(
-            f"No camera could be placed: the {len(photographs)} pictures share too few details. Take more photographs "
-            "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
-            "zoom and without mirrors or bare walls filling the picture; then try again."
+            f"No camera could be placed: the {len(photographs)} pictures {cause}. Take more photographs that overlap "
+            "by two thirds, from places some steps apart (do not turn on the spot), sharp, with one zoom and without "
+            "mirrors or bare walls filling the picture; then try again.",
+            cause,
         )
     align_to_gps(require_pycolmap(), best[0], folder)
     best[0].write_binary(make_folder(sparse))

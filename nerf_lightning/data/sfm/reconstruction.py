@@ -32,7 +32,11 @@ Report = Callable[[str, float], None]
 
 
 class NothingFoundError(InputError):
-    """Photographs none of whose cameras could be placed."""
+    """Photographs none of whose cameras could be placed; `cause` completes "the pictures ..."."""
+
+    def __init__(self, message: str, cause: str):
+        super().__init__(message)
+        self.cause = cause
 
 
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
@@ -41,6 +45,8 @@ FEWEST_POINTS = 30
 """That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
+OF_ONE_PLACE = 0.5
+"""Of the compared pairs: where more share many details and nothing is placed, the camera has not moved."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,16 @@ def in_short(models: list[Any], names: list[str]) -> SparseModel:
         num_cameras=model.num_cameras(),
         reprojection_error=model.compute_mean_reprojection_error(),
     )
+
+
+def cause_of_nothing(work: Path, attempt: Attempt) -> str:
+    """Return why an attempt has placed no camera: "the pictures ..."."""
+    with _opened(require_pycolmap(), work / attempt.database) as content:
+        _, inliers = content.read_two_view_geometry_num_inliers()
+    alike = sum(count >= FEWEST_POINTS for count in inliers)
+    if alike and alike > OF_ONE_PLACE * len(inliers):
+        return "show the same details, and all from one place, which says nothing of depth"
+    return "share too few details"
 
 
 @contextmanager
