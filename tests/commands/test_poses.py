@@ -114,7 +114,7 @@ def test_heic_is_named_or_passed_over_and_panoramas_among_other_photographs_are_
 
 @pytest.mark.parametrize(
     ("pictures", "blur", "said"),
-    [(4, 6, "are nearly all blurred, although"), (4, 0, "share too few"), (1, 0, "all from one place")],
+    [(4, 6, "are nearly all blurred, although"), (4, 0, "share too few"), (1, 0, "without depth, all from one place")],
 )
 def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, pictures, blur, said):
     imageio = pytest.importorskip("imageio.v3")

@@ -45,8 +45,8 @@ FEWEST_POINTS = 30
 """That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
-OF_ONE_PLACE = 0.5
-"""Of the compared pairs: where more share many details and nothing is placed, the camera has not moved."""
+WITHOUT_DEPTH = "show the same details without depth, all from one place or of one flat thing"
+"""Why nothing was found, where more than half of the compared pairs say so."""
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,12 @@ def in_short(models: list[Any], names: list[str]) -> SparseModel:
 
 def cause_of_nothing(work: Path, attempt: Attempt) -> str:
     """Return why an attempt has placed no camera: "the pictures ..."."""
-    with _opened(require_pycolmap(), work / attempt.database) as content:
-        _, inliers = content.read_two_view_geometry_num_inliers()
-    alike = sum(count >= FEWEST_POINTS for count in inliers)
-    if alike and alike > OF_ONE_PLACE * len(inliers):
-        return "show the same details, and all from one place, which says nothing of depth"
-    return "share too few details"
+    colmap = require_pycolmap()
+    kinds = colmap.TwoViewGeometryConfiguration
+    with _opened(colmap, work / attempt.database) as content:
+        _, pairs = content.read_two_view_geometries()
+    flat = [pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC) for pair in pairs]
+    return WITHOUT_DEPTH if 2 * sum(flat) > len(pairs) else "share too few details"
 
 
 @contextmanager
