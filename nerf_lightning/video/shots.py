@@ -33,6 +33,7 @@ from nerf_lightning.video.settings import FilmSettings
 
 # The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 12, 64
+MOST_POINTS = 1000  # Of the content
 IN_MOST = 0.6  # Of the views: what they show in their middle is what the capture is about.
 
 log = logging.getLogger(__name__)
@@ -159,7 +160,8 @@ def content_of(subject: Subject, tile_points: int) -> Float[Tensor, "points 3"]:
         points.append(surface[(picture.opacity > 0.5) & surface.isfinite().all(dim=-1)])
     every = torch.cat(points)
     share = torch.stack([_in_middle(shot.cameras, view, every) for view in views]).float().mean(dim=0)
-    return every[share >= IN_MOST]
+    content = every[share >= IN_MOST]
+    return content[:: 1 + len(content) // MOST_POINTS]
 
 
 def _in_middle(cameras: Cameras, view: int, points: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:

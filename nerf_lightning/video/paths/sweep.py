@@ -90,7 +90,8 @@ def step_back(cameras: Cameras, content: Float[Tensor, "points 3"], most: Float[
     half = 0.5 * MIDDLE * torch.stack([cameras.width, cameras.height], dim=-1) / cameras.focal
     x, y, minus_z = ((content - cameras.c2w[:, None, :, 3]) @ cameras.c2w[:, :, :3]).unbind(dim=-1)
     needed = torch.maximum(x.abs() / half[:, :1], y.abs() / half[:, 1:]) + minus_z
-    length = needed.quantile(FRAMED, dim=1).clamp(min=0.0).minimum(most)
+    most_of_them = math.ceil(FRAMED * len(content))
+    length = needed.kthvalue(most_of_them, dim=1).values.clamp(min=0.0).minimum(most)
     reach = len(length) // (2 * EASED)
     eased = torch.stack([length.roll(step) for step in range(-reach, reach + 1)]).mean(dim=0)
     c2w = cameras.c2w.clone()
