@@ -14,7 +14,7 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
-CROSSED_BY_A_CIRCLE, CROSSED, TIMES_THE_USUAL = 75.0, 25.0, 2.5
+CROSSED_BY_A_CIRCLE, CROSSED, TIMES_THE_USUAL = 75.0, 25.0, 3.0
 """Degrees between neighbouring photographs, seen from above, over which a path may lead: these, or so many times the
 median where photographs lie farther apart; a circle over at most the first."""
 OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
