@@ -34,7 +34,7 @@ from nerf_lightning.video.settings import FilmSettings
 # The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 12, 64
 MOST_POINTS = 1000  # Of the content
-IN_MOST = 0.6  # Of the views: what they show in their middle is what the capture is about.
+IN_MOST = 0.5  # Of the views: what these show in their middle is what the capture is about.
 
 log = logging.getLogger(__name__)
 
