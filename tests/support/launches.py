@@ -1,0 +1,102 @@
+"""What a step asks of a GPU that is not here: operations, triton's kernels, and the bytes that both touch.
+
+Counted on `support.stand_in_device` by another of torch's modes. The kernels run through triton's interpreter, which
+TRITON_INTERPRET=1 chooses before they are imported: `measured` is for a process of its own.
+"""
+
+import json
+import sys
+from collections import Counter
+from typing import Any, Self
+
+import torch
+from support.gpu_training import small, step_by_step
+from support.stand_in_device import StandInDevice, lies_there
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils._pytree import tree_leaves
+from triton.runtime.interpreter import InterpretedFunction
+
+from nerf_lightning.nerf.kernels import backends
+
+STEPS = 3
+ALLOCATES = {"aten::empty.memory_format", "aten::empty_like", "aten::new_empty", "aten::empty_strided", "aten::detach"}
+
+
+class Launches(TorchDispatchMode):
+    """Count `operations` on the device, `kernels` of triton's, operations of the `host`, and `bytes` on the device.
+
+    An operation counts once, though some start several kernels (a sort) and others copy. Bytes are those of all arrays
+    that an operation or a kernel takes or returns, each once, however much of it is read.
+
+    Args:
+        computes: whether kernels run. Else they do nothing, and what is allocated for their results is zero.
+    """
+
+    def __init__(self, computes: bool = True):
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+        self.computes = computes
+
+    def __enter__(self) -> Self:
+        self._run = InterpretedFunction.run
+        InterpretedFunction.run = lambda kernel, *args, **options: self._launch(kernel, *args, **options)
+        return super().__enter__()
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        InterpretedFunction.run = self._run
+
+    def _launch(self, kernel: InterpretedFunction, *args: Any, **options: Any) -> None:
+        self.counts.update(kernels=1, bytes=_bytes([*args, *options.values()]))
+        if self.computes:
+            with _disable_current_modes(), torch._C.DisableTorchFunction():
+                self._run(kernel, *args, **options)
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with torch._C.DisableTorchFunction():  # the stand-in has seen what Python asked for
+            made = func(*args, **(kwargs or {}))
+        if func.name() in ALLOCATES:
+            if not self.computes and func.name() != "aten::detach":
+                made.zero_()
+        elif not _is_view(func):
+            tensors = [each for each in tree_leaves((args, kwargs, made)) if isinstance(each, Tensor)]
+            if any(map(lies_there, tensors)):
+                self.counts.update(operations=1, bytes=_bytes(tensors))
+            else:
+                self.counts.update(host=1)
+        return made
+
+
+def _is_view(func: Any) -> bool:
+    returns = func._schema.returns
+    return bool(returns) and all(each.alias_info is not None and not each.alias_info.is_write for each in returns)
+
+
+def _bytes(values: list[Any]) -> int:
+    tensors = [each for each in values if isinstance(each, Tensor)]
+    return sum(min(each.nbytes, each.untyped_storage().nbytes()) for each in tensors)  # expanded ones are smaller
+
+
+def measured(model: str, precision: str) -> dict[str, Any]:
+    """Return what one warm step and one rendered tile of a small model ask for, and losses with and without kernels."""
+    with StandInDevice("cuda") as there, Launches() as launches:
+        run = step_by_step(model, there.device, precision, None, *small(model))
+        for _ in range(STEPS):
+            launches.counts.clear()
+            run.step()
+        step, losses = dict(launches.counts), run.all_losses().tolist()
+        rays = run.training.rays(run.loader.at(0, 0).pixels)
+        launches.counts.clear()
+        with torch.no_grad():
+            run.training.model.eval()(rays, torch.ones_like(rays.origins), None)
+        tile = dict(launches.counts)
+        with backends.without(*backends.CUDA_BACKENDS):
+            run = step_by_step(model, there.device, precision, None, *small(model))
+            for _ in range(STEPS):
+                run.step()
+    return {"step": step, "tile": tile, "losses": losses, "without": run.all_losses().tolist()}
+
+
+if __name__ == "__main__":
+    json.dump(measured(*sys.argv[1:]), sys.stdout)
