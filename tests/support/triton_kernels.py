@@ -1,10 +1,15 @@
 """The smaller triton kernels against their references, on a GPU or through triton's interpreter."""
 
 import importlib
+from contextlib import contextmanager
+from dataclasses import replace
+from unittest.mock import patch
 
 import torch
 
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam.step import adam_step_torch
@@ -14,6 +19,9 @@ from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transm
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
 from nerf_lightning.nerf.randomness import batch_random, purpose_word
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
+from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
+from nerf_lightning.nerf.rendering.quadrature import closed_weights, weights_from_density
+from nerf_lightning.nerf.rendering.sample_points import points_along, ragged_points
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -23,7 +31,8 @@ SMALL = [name for name in backends.CUDA_BACKENDS if name not in ("hash_grid.cuda
 def check_all(device, generator, rays=70):
     for name in SMALL:
         kernels = importlib.import_module(f"{backends.KERNELS}.{name}")
-        kernels.trial(device)
+        with forced():
+            kernels.trial(device)
         globals()[f"check_{name.partition('.')[0]}"](kernels, device, generator, rays)
 
 
@@ -74,6 +83,10 @@ def check_march(kernels, device, generator, rays):
     cases = [(share, limit, capacity) for share in (0.0, 0.03, 1.0) for limit, capacity in ((None, 4000), (5, None))]
     for share, limit, capacity in [*cases, (0.5, None, 100), (0.5, None, None)]:
         given = a_march(device, generator, rays, share)
+        for one, other in zip(
+            kernels.distances_in_box(given[0], given[3].aabb), (given[1].enter, given[1].leave), strict=True
+        ):
+            torch.testing.assert_close(one, other)
         found, following = kernels.march(*given, limit, capacity)
         expected, expected_following = march_torch(*given, limit, capacity)
         assert found.longest == expected.longest
@@ -161,3 +174,69 @@ def rendering(edges, weights, contracted=False):
     edges, nothing = edges.to(weights.dtype), weights.new_zeros(len(weights))
     light = nothing[:, None].expand(-1, 3)
     return DenseRendering(light, light, nothing, nothing, weights=weights, samples=RaySamples(edges, contracted))
+
+
+def check_render(kernels, device, generator, rays):
+    """From rays to pixels, with gradients, against the levels' way in plain torch and float64."""
+    for samples_of in (some_dense_samples, some_ragged_samples):
+        for contracted, colored, whole_from in ((False, True, 0.0), (True, True, 3.0), (True, False, 0.0)):
+            samples = samples_of(device, generator, rays, padding=9)
+            field = NGPField(
+                HashGridEncoder(4, 2, 8, 4, 32), SphericalHarmonicsEncoder(), width=16, contraction=contracted
+            )
+            for parameter in field.parameters():
+                parameter.data.uniform_(-0.5, 0.5, generator=generator)
+            field.aabb.copy_(1.5 * torch.tensor([[-1.0] * 3, [1.0] * 3]))
+            field.least_slope = 0.003
+            field.to(device)
+            origins = torch.tensor([0.0, 0.0, -2.0]) + 0.5 * torch.randn(rays, 3, generator=generator)
+            directions = torch.nn.functional.normalize(
+                0.3 * torch.randn(rays, 3, generator=generator) - origins, dim=-1
+            )
+            bundle = RayBundle(origins, directions, origins[:, 0], origins[:, 0], directions).to(device)
+            parts = field.parts()
+            parts = parts if colored else replace(parts, color_weights=[])
+            with forced():
+                found = kernels.render(bundle, samples, parts, "float32", True, whole_from)
+            grads = [torch.randn(each.shape, generator=generator).to(device) for each in found]
+            torch.autograd.backward(found, grads)
+            gradients = [parameter.grad.clone() for parameter in field.parameters() if parameter.grad is not None]
+            expected = in_double(field.double(), bundle, samples, colored, whole_from)
+            field.zero_grad()
+            torch.autograd.backward(expected, [each.double() for each in grads])
+            for one, other in zip(found, expected, strict=True):
+                torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-5)
+            others = [parameter.grad for parameter in field.parameters() if parameter.grad is not None]
+            for one, other in zip(gradients, others, strict=True):
+                assert float((one - other).norm()) <= 1e-4 * float(other.norm()), (one.shape, contracted, colored)
+
+
+def some_dense_samples(device, generator, rays, padding):
+    edges = 0.5 + torch.rand(rays, 38, generator=generator).cumsum(dim=-1) / 6
+    return RaySamples(edges.to(device), contracted_spacing=True)
+
+
+def in_double(field, rays, samples, colored, whole_from):
+    """Foreground, opacity, depth and weights in plain torch."""
+    double = [each.map(lambda part: part.double() if part.is_floating_point() else part) for each in (rays, samples)]
+    dense = isinstance(samples, RaySamples)
+    output = field((points_along if dense else ragged_points)(*double, None))
+    output = output if colored else replace(output, rgb=torch.zeros_like(output.rgb))
+    output = soften_near_gradients(output, double[1].midpoints, whole_from)
+    if not dense:
+        return integrate_torch(output.density, output.rgb, double[1])
+    weights = closed_weights(weights_from_density(output.density, double[1].deltas))
+    depth = (weights * double[1].midpoints).sum(dim=-1)
+    return (weights[..., None] * output.rgb).sum(dim=-2), weights.sum(dim=-1), depth, weights
+
+
+@contextmanager
+def forced():
+    """Let the quadrature be the one for CUDA, on whatever device."""
+    from nerf_lightning.nerf.kernels.ragged import cuda, integrate
+
+    with (
+        patch.object(integrate, "backend_for", lambda *given: cuda),
+        patch.object(integrate, "cuda_backend", lambda *given: cuda),
+    ):
+        yield

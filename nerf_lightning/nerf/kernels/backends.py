@@ -29,7 +29,7 @@ CPU_BACKENDS = (
 """The modules that numba compiles."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
-    *("histograms.cuda", "adam.cuda"),
+    *("render.cuda", "histograms.cuda", "adam.cuda"),
 )
 """The modules that triton compiles."""
 LONG_SECONDS = 2.0

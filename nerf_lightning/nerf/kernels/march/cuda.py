@@ -11,12 +11,11 @@ import triton
 import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
-from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
+LANES = 256
 RAYS = 32
 """Of a program: a warp, whose lanes wait for each other."""
 
@@ -32,27 +31,37 @@ def march(
     """Return the occupied intervals and where each ray would go on; the arguments are those of `march.march`."""
     count, intervals, device = rays.near.shape[0], lattice.shape[0] - 2, lattice.device
     longest = intervals if limit is None else min(limit, intervals)
-    counts = torch.empty(count, dtype=torch.int64, device=device)
-    following = torch.empty_like(counts)
-    center, half = center_and_half(grid.aabb)
-    given = (rays.origins, rays.directions, state.enter, state.leave, state.jitter, state.next, lattice, center, half)
+    bounds = torch.empty(count + 1, dtype=torch.int64, device=device)
+    following = torch.empty_like(bounds[1:])
+    given = (rays.origins, rays.directions, state.enter, state.leave, state.jitter, state.next, lattice, grid.aabb)
     arrays = *(each.contiguous() for each in given), grid.cells, grid.leaps
     sizes = count, intervals, grid.cells.shape[0], longest
-    programs = (triton.cdiv(count, RAYS),)
-    if count:
-        _march[programs](*arrays, counts, following, counts, counts, counts, *sizes, 0, False, BLOCK, RAYS, num_warps=1)
-    bounds = functional.pad(counts.cumsum(0), (1, 0))
+    programs = (max(1, triton.cdiv(count, RAYS)),)
+    _march[programs](*arrays, bounds, following, bounds, bounds, bounds, *sizes, 0, False, BLOCK, RAYS, num_warps=1)
+    bounds = bounds.cumsum(0)
     found = bounds[-1]
     if capacity is None:
         capacity = int(found)
     else:
-        bounds = bounds.clamp(max=capacity)
+        bounds = bounds.clamp(max=capacity)  # the last rays lose what does not fit
     index = torch.empty(capacity, dtype=torch.int64, device=device)
     starts, ends = torch.empty(capacity, device=device), torch.empty(capacity, device=device)
-    if count and capacity:
+    if count:
         out = bounds, index, index, starts, ends
         _march[programs](*arrays, *out, *sizes, capacity, True, BLOCK, RAYS, num_warps=1)
     return RaggedSamples(index, starts, ends, bounds, found, longest), following
+
+
+def distances_in_box(
+    rays: RayBundle, aabb: Float[Tensor, "2 3"]
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Return where each ray enters and leaves a box (`geometry.boxes.distances_in_box`)."""
+    enter, leave = torch.empty_like(rays.near), torch.empty_like(rays.near)
+    if count := rays.near.shape[0]:
+        given = rays.origins, rays.directions, rays.near, rays.far, aabb
+        arrays = *(each.contiguous() for each in given), enter, leave
+        _enter[(triton.cdiv(count, LANES),)](*arrays, count, LANES)
+    return enter, leave
 
 
 def trial(device: str = "cuda") -> None:
@@ -63,9 +72,45 @@ def trial(device: str = "cuda") -> None:
     aabb = torch.tensor([[-1.0] * 3, [1.0] * 3], device=device)
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     lattice = torch.linspace(1.0, 3.2, 12, device=device)
-    samples, _ = march(rays, MarchState(one, 3 * one, 0 * one, 0 * one.long()), lattice, grid, None, None)
+    enter, leave = distances_in_box(rays, aabb)
+    samples, _ = march(rays, MarchState(enter, leave, 0 * one, 0 * one.long()), lattice, grid, None, None)
     if int(samples.found) != 10:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
+
+
+@triton.jit
+@no_type_check
+def _in_box(origins, directions, aabb, ray, valid, axis: tl.constexpr):
+    """Return one coordinate of origins and directions where the box is the cube from -1 to 1."""
+    low, high = tl.load(aabb + axis), tl.load(aabb + 3 + axis)
+    half = 0.5 * (high - low)
+    origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0) - 0.5 * (low + high)
+    return origin / half, tl.load(directions + 3 * ray + axis, mask=valid, other=0.0) / half
+
+
+@triton.jit
+@no_type_check
+def _between_faces(origins, directions, aabb, ray, valid, axis: tl.constexpr):
+    """Return where rays pass the two faces of the box on an axis, the nearer first."""
+    direction = tl.load(directions + 3 * ray + axis, mask=valid, other=1.0)
+    inverse = 1.0 / tl.where(direction == 0.0, 1e-20, direction)
+    origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0)
+    a, b = (tl.load(aabb + axis) - origin) * inverse, (tl.load(aabb + 3 + axis) - origin) * inverse
+    return tl.minimum(a, b), tl.maximum(a, b)
+
+
+@triton.jit
+@no_type_check
+def _enter(origins, directions, near, far, aabb, enter, leave, count, block: tl.constexpr):
+    ray = tl.program_id(0) * block + tl.arange(0, block)
+    valid = ray < count
+    x0, x1 = _between_faces(origins, directions, aabb, ray, valid, 0)
+    y0, y1 = _between_faces(origins, directions, aabb, ray, valid, 1)
+    z0, z1 = _between_faces(origins, directions, aabb, ray, valid, 2)
+    first = tl.maximum(tl.maximum(x0, y0), tl.maximum(z0, tl.load(near + ray, mask=valid, other=0.0)))
+    last = tl.minimum(tl.minimum(x1, y1), tl.minimum(z1, tl.load(far + ray, mask=valid, other=0.0)))
+    tl.store(enter + ray, first, mask=valid)
+    tl.store(leave + ray, last, mask=valid)
 
 
 @triton.jit
@@ -87,21 +132,16 @@ def _ahead(unit, speed, around):
 @triton.jit
 @no_type_check
 def _march(
-    origins, directions, enter, leave, jitters, first, lattice, center, half, cells, leaps,
+    origins, directions, enter, leave, jitters, first, lattice, aabb, cells, leaps,
     bounds, following, index, starts, ends, count, intervals, resolution, most, capacity,
     write: tl.constexpr, side: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     lane = tl.arange(0, block)
     ray = tl.program_id(0) * block + lane
     valid = ray < count
-    # In coordinates of the box, which is the cube from -1 to 1.
-    hx, hy, hz = tl.load(half), tl.load(half + 1), tl.load(half + 2)
-    ox = (tl.load(origins + 3 * ray, mask=valid, other=0.0) - tl.load(center)) / hx
-    oy = (tl.load(origins + 3 * ray + 1, mask=valid, other=0.0) - tl.load(center + 1)) / hy
-    oz = (tl.load(origins + 3 * ray + 2, mask=valid, other=0.0) - tl.load(center + 2)) / hz
-    dx = tl.load(directions + 3 * ray, mask=valid, other=0.0) / hx
-    dy = tl.load(directions + 3 * ray + 1, mask=valid, other=0.0) / hy
-    dz = tl.load(directions + 3 * ray + 2, mask=valid, other=0.0) / hz
+    ox, dx = _in_box(origins, directions, aabb, ray, valid, 0)
+    oy, dy = _in_box(origins, directions, aabb, ray, valid, 1)
+    oz, dz = _in_box(origins, directions, aabb, ray, valid, 2)
     near, far = tl.load(enter + ray, mask=valid, other=1.0), tl.load(leave + ray, mask=valid, other=0.0)
     jitter = tl.load(jitters + ray, mask=valid, other=0.0)
     k = tl.load(first + ray, mask=valid, other=0).to(tl.int32)
@@ -159,5 +199,7 @@ def _march(
             tl.store(starts + slot, tl.zeros([block], tl.float32), mask=rest)
             tl.store(ends + slot, tl.zeros([block], tl.float32), mask=rest)
     else:
-        tl.store(bounds + ray, found.to(tl.int64), mask=valid)
+        tl.store(bounds + 1 + ray, found.to(tl.int64), mask=valid)
+        if tl.program_id(0) == 0:
+            tl.store(bounds, 0)
         tl.store(following + ray, k.to(tl.int64), mask=valid)

@@ -1,5 +1,6 @@
-"""Volume rendering of ragged samples for CUDA: a program sums along a ray, 32 samples at a time.
+"""Volume rendering for CUDA: a program sums along a ray, 32 samples at a time.
 
+Where all rays have equally many samples, `starts` and `ends` are views of their fenceposts, and there are no bounds.
 Letters as in `kernels.ragged.integrate`. Sums along a ray have a fixed order, so the results are the same in each run.
 `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
@@ -23,18 +24,27 @@ def integrate(
     starts: Float[Tensor, "n"],
     ends: Float[Tensor, "n"],
     bounds: Int[Tensor, "bounds"],
+    each: int = 0,
     closed: bool = False,
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "n"]]:
     """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w.
 
-    Where rays are closed, their last sample takes all the light that is left.
+    Args:
+        density: per unit length.
+        rgb: in [0, 1].
+        starts: where each interval begins.
+        ends: where it ends.
+        bounds: the samples of ray r are those from bounds[r] to bounds[r + 1].
+        each: samples of every ray, where there are no bounds; 0: as the bounds say.
+        closed: whether the last sample of a ray takes all the light that is left.
     """
-    rays, capacity = bounds.shape[0] - 1, density.shape[0]
+    capacity = density.shape[0]
+    rays = capacity // each if each else bounds.shape[0] - 1
     foreground, weights = density.new_empty(rays, 3), torch.empty_like(density)
     opacity, depth = density.new_empty(rays), density.new_empty(rays)
     if rays:
         arrays = density, rgb, starts, ends, bounds, foreground, opacity, depth, weights
-        _integrate[(rays,)](*arrays, capacity, rays, closed, BLOCK, num_warps=1)
+        _integrate[(rays,)](*arrays, capacity, rays, each, closed, BLOCK, num_warps=1)
     return foreground, opacity, depth, weights
 
 
@@ -49,14 +59,16 @@ def integrate_gradient(
     of_opacity: Float[Tensor, "rays"],
     of_depth: Float[Tensor, "rays"],
     of_weights: Float[Tensor, "n"],
+    each: int = 0,
     closed: bool = False,
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Return the gradients of density and colour, given those of the four results."""
     of_density, of_rgb = torch.empty_like(density), torch.empty_like(rgb)
-    rays, capacity = bounds.shape[0] - 1, density.shape[0]
+    capacity = density.shape[0]
+    rays = capacity // each if each else bounds.shape[0] - 1
     if rays:
         arrays = density, rgb, starts, ends, bounds, weights, of_foreground, of_opacity, of_depth, of_weights
-        _integrate_back[(rays,)](*arrays, of_density, of_rgb, capacity, rays, closed, BLOCK, num_warps=1)
+        _integrate_back[(rays,)](*arrays, of_density, of_rgb, capacity, rays, each, closed, BLOCK, num_warps=1)
     return of_density, of_rgb
 
 
@@ -90,6 +102,21 @@ def _alpha(optical):
 
 @triton.jit
 @no_type_check
+def _samples_of(bounds, ray, each):
+    """Return the first sample of a ray, the one after its last, and by how much its intervals' numbers are higher."""
+    if each > 0:
+        first = ray.to(tl.int64) * each
+        last = first + each
+        shift = ray
+    else:
+        first = tl.load(bounds + ray)
+        last = tl.load(bounds + ray + 1)
+        shift = ray * 0
+    return first, last, shift
+
+
+@triton.jit
+@no_type_check
 def _optical(density, starts, ends, sample, valid):
     """Return density times length of some samples, and where their middles are."""
     begin, end = tl.load(starts + sample, mask=valid, other=0.0), tl.load(ends + sample, mask=valid, other=0.0)
@@ -110,11 +137,12 @@ def _light(before, density, starts, ends, sample, first, valid):
 @triton.jit
 @no_type_check
 def _integrate(
-    density, rgb, starts, ends, bounds, foreground, opacity, depth, weights, capacity, rays,
+    density, rgb, starts, ends, bounds, foreground, opacity, depth, weights, capacity, rays, each: tl.constexpr,
     closed: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     ray, lane = tl.program_id(0), tl.arange(0, block)
-    first, last = tl.load(bounds + ray), tl.load(bounds + ray + 1)
+    first, last, shift = _samples_of(bounds, ray, each)
+    starts, ends = starts + shift, ends + shift
     before, reds, greens, blues, total, far = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for start in range(first, last, block):
         sample = start + lane
@@ -136,7 +164,8 @@ def _integrate(
     tl.store(foreground + 3 * ray + 2, blues)
     tl.store(opacity + ray, total)
     tl.store(depth + ray, far)
-    for start in range(tl.load(bounds + rays) + ray * block, capacity, rays * block):  # padding
+    used = capacity if each > 0 else tl.load(bounds + rays)
+    for start in range(used + ray * block, capacity, rays * block):  # padding
         tl.store(weights + start + lane, tl.zeros([block], tl.float32), mask=start + lane < capacity)
 
 
@@ -144,10 +173,11 @@ def _integrate(
 @no_type_check
 def _integrate_back(
     density, rgb, starts, ends, bounds, weights, of_foreground, of_opacity, of_depth, of_weights, of_density, of_rgb,
-    capacity, rays, closed: tl.constexpr, block: tl.constexpr,
+    capacity, rays, each: tl.constexpr, closed: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     ray, lane = tl.program_id(0), tl.arange(0, block)
-    first, last = tl.load(bounds + ray), tl.load(bounds + ray + 1)
+    first, last, shift = _samples_of(bounds, ray, each)
+    starts, ends = starts + shift, ends + shift
     of_red, of_green = tl.load(of_foreground + 3 * ray), tl.load(of_foreground + 3 * ray + 1)
     of_blue = tl.load(of_foreground + 3 * ray + 2)
     toward_opacity, toward_depth = tl.load(of_opacity + ray), tl.load(of_depth + ray)
@@ -181,7 +211,8 @@ def _integrate_back(
         tl.store(of_rgb + 3 * sample + 1, w * of_green, mask=valid)
         tl.store(of_rgb + 3 * sample + 2, w * of_blue, mask=valid)
     nothing = tl.zeros([block], tl.float32)
-    for start in range(tl.load(bounds + rays) + ray * block, capacity, rays * block):  # padding
+    used = capacity if each > 0 else tl.load(bounds + rays)
+    for start in range(used + ray * block, capacity, rays * block):  # padding
         sample = start + lane
         tl.store(of_density + sample, nothing, mask=sample < capacity)
         for channel in tl.static_range(3):

@@ -14,10 +14,13 @@ from nerf_lightning.nerf.kernels.backends import backend_for, cuda_backend
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.types.rays import RaggedSamples
 
+Integrated = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "*samples"]]
+"""Per ray, sum of w rgb, sum of w, sum of w t; and the weights w."""
+
 
 def integrate(
     density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: RaggedSamples
-) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "capacity"]]:
+) -> Integrated:
     """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w."""
     backend = backend_for("ragged", density.device)
     if backend is None or density.dtype != torch.float32 or rgb.dtype != torch.float32:
@@ -30,7 +33,7 @@ def integrate_dense(
     rgb: Float[Tensor, "*rays samples 3"],
     edges: Float[Tensor, "*rays edges"],
     closed: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+) -> Integrated | None:
     """Return the same for rays with equally many samples; None where there is no kernel for it.
 
     Args:
@@ -43,11 +46,9 @@ def integrate_dense(
     backend = cuda_backend("ragged.cuda", density.device) if single and not edges.requires_grad else None
     if backend is None:
         return None
-    shape, count = density.shape[:-1], density.shape[-1]
-    bounds = torch.arange(0, density.numel() + 1, count, device=density.device)
-    starts, ends = edges[..., :-1].flatten(), edges[..., 1:].flatten()
-    found = _Integrate.apply(density.flatten(), rgb.flatten(0, -2), starts, ends, bounds, backend, closed)
-    foreground, opacity, depth, weights = found
+    shape, fenceposts = density.shape[:-1], edges.contiguous().flatten()
+    given = density.flatten(), rgb.flatten(0, -2), fenceposts, fenceposts[1:], fenceposts
+    foreground, opacity, depth, weights = _Integrate.apply(*given, backend, density.shape[-1], closed)
     return foreground.view(*shape, 3), opacity.view(shape), depth.view(shape), weights.view_as(density)
 
 
@@ -72,12 +73,12 @@ class _Integrate(torch.autograd.Function):
         ends: Tensor,
         bounds: Tensor,
         backend: Any,
-        *closed: bool,
+        *dense: int,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         density, rgb = density.contiguous(), rgb.contiguous()
-        foreground, opacity, depth, weights = backend.integrate(density, rgb, starts, ends, bounds, *closed)
+        foreground, opacity, depth, weights = backend.integrate(density, rgb, starts, ends, bounds, *dense)
         ctx.save_for_backward(density, rgb, starts, ends, bounds, weights)
-        ctx.backend, ctx.closed = backend, closed
+        ctx.backend, ctx.dense = backend, dense
         return foreground, opacity, depth, weights
 
     @staticmethod
@@ -85,6 +86,6 @@ class _Integrate(torch.autograd.Function):
     def backward(ctx: Any, foreground: Tensor, opacity: Tensor, depth: Tensor, weights: Tensor) -> tuple[Any, ...]:
         grads = (foreground, opacity, depth, weights)
         density, rgb = ctx.backend.integrate_gradient(
-            *ctx.saved_tensors, *(grad.contiguous() for grad in grads), *ctx.closed
+            *ctx.saved_tensors, *(grad.contiguous() for grad in grads), *ctx.dense
         )
         return density, rgb, *[None] * (len(ctx.needs_input_grad) - 2)
