@@ -75,15 +75,16 @@ def default_callbacks(*changes: str):
     return list(build(composed("train", *changes).callbacks).values())
 
 
-def small(model):
-    """Return the changes that make a model quick."""
+def small(model, **settings):
+    """Return the changes that make a model quick: `QUICK`, and other settings, by the last word of their keys."""
+    chosen = QUICK | settings
 
     def within(place, settings):
         for name, value in settings.items():
             if isinstance(value, dict):
                 yield from within(f"{place}.{name}", value)
-            elif name in QUICK:
-                yield f"{place}.{name}={QUICK[name]}"
+            elif name in chosen:
+                yield f"{place}.{name}={chosen[name]}"
 
     config = OmegaConf.to_container(composed("train", f"model={model}"), resolve=False)
     return ["data.batch_rays=8", *within("model", config["model"]), *within("encoder", config["encoder"])]

@@ -1,0 +1,59 @@
+"""What a step asks of a GPU is counted on a stand-in, and may only become less; what the kernels compute is torch's.
+
+Three steps of each model, every kernel of triton's in its place, through triton's interpreter.
+"""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("triton", reason="triton is not installed (Linux only)")
+
+BUDGETS = {
+    # On the device (operations and kernels): a step, a rendered tile. On the host: a step.
+    "fast_small,bf16-mixed": (250, 265, 32),
+    "fast_proposal,bf16-mixed": (351, 96, 32),
+    "nerf_tiny,bf16-mixed": (466, 130, 34),
+    "fast,bf16-mixed": (0, 0, 0),
+    "fast,32-true": (0, 0, 0),
+    "fast_proposal,32-true": (0, 0, 0),
+}
+QUICK = list(BUDGETS)[:3]
+CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
+# How far losses may be apart after up to two steps: bfloat16 has 8 bits, and Adam's first steps follow signs.
+TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}
+
+
+@functools.cache
+def measured(*cases):
+    """In a process of their own: the interpreter is chosen when the kernels are defined."""
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
+    command = [sys.executable, "-m", "support.launches", *cases]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def found(case):
+    return measured(*(QUICK if case in QUICK else [case]))[case]
+
+
+@pytest.mark.xdist_group("launches")
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_asks_for_no_more_than_it_did(case):
+    step, tile = found(case)["step"], found(case)["tile"]
+    counted = *(each["operations"] + each["kernels"] for each in (step, tile)), step["host"]
+    print(f'    "{case}": {counted},')  # pytest -rP shows the table anew
+    assert all(asked <= budget for asked, budget in zip(counted, BUDGETS[case], strict=True)), (counted, BUDGETS[case])
+
+
+@pytest.mark.xdist_group("launches")
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_learn_what_torch_does(case):
+    seen, precision = found(case), case.split(",")[1]
+    assert seen["step"]["kernels"] > 0
+    assert seen["losses"] == pytest.approx(seen["without"], rel=TOLERANCE[precision])
