@@ -1,11 +1,12 @@
 """What is known of GPUs without one, as tables in Markdown.
 
     python tests/gpu_report.py kernels [sm_89 ...]
-    python tests/gpu_report.py steps [fast ...]
+    python tests/gpu_report.py steps|memory [fast ...]
 
 `kernels`: registers, bytes that no register had room for, and bytes of shared memory of each of triton's kernels, as it
 compiles them ahead of time for a step and a tile of model=fast and fast_proposal. `steps`: operations, bytes and
 arithmetic of a step at the batch of each model, counted on a stand-in, and the least time that they take on a few GPUs.
+`memory`: what training a model takes in all, and the largest batches for GPUs of 8, 12 and 24 GB.
 """
 
 import re
@@ -20,6 +21,9 @@ from support.gpu_training import small, step_by_step
 from support.launches import KERNEL, Launches
 from support.stand_in_device import StandInDevice
 
+from nerf_lightning.commands.train_job.memory_trial import PeakBytes
+
+OTHERS = ("auto", "view_transformer", "view_transformer_tiny")
 COMPILED = ("fast", "fast_proposal")
 SHARES = (1 / 64, 1 / 32)
 """Of a batch, which are counted: what a step asks for is a constant and a part that grows with the batch."""
@@ -27,6 +31,8 @@ CARDS = {"T4": (320, 8), "RTX 3060": (360, 25), "RTX 4090": (1008, 165), "A100":
 """GB/s of memory and TFLOP/s, bfloat16 (T4: float32), of NVIDIA's data sheets."""
 LAUNCH = (6, 9)
 """Microseconds that torch takes to begin an operation, about."""
+GIGABYTES, FREE, CONTEXT = (8, 12, 24), 0.9, 0.6
+"""Of cards; the share that a desktop and the allocator's gaps leave; and what CUDA and its libraries take."""
 
 
 def kernels(names: list[str]) -> None:
@@ -65,28 +71,50 @@ def steps(models: list[str]) -> None:
     """Print a row for each model."""
     print("| model | rays, samples | operations | GB | TFLOP |", " | ".join(CARDS), "|\n|" + "---|" * (5 + len(CARDS)))
     for model in models:
-        data = composed("train", f"model={model}").data
-        counts = dict(zip(SHARES, (counted(model, data, share) for share in SHARES), strict=True))
-        few, more = counts.values()
-        whole = {key: few[key] + (more[key] - few[key]) / (SHARES[1] - SHARES[0]) * (1 - SHARES[0]) for key in more}
+        data, few, slope = measured(model)
+        whole = {key: few[key] + (1 - SHARES[0]) * slope[key] for key in few}
         asked = few["operations"] + few["kernels"]
         times = (bound(asked, whole, *card) for card in CARDS.values())
-        batch = f"{data.batch_rays:,} rays" if data.sample_budget is None else f"{data.sample_budget:,} samples"
-        row = batch, str(asked), f"{whole['bytes'] / 1e9:.2f}", f"{whole.get('flops', 0) / 1e12:.3f}", *times
+        row = batch(data, 1), str(asked), f"{whole['bytes'] / 1e9:.2f}", f"{whole.get('flops', 0) / 1e12:.3f}", *times
         print(f"| {model} |", " | ".join(row), "|", flush=True)
 
 
+def memory(models: list[str]) -> None:
+    """Print a row for each model."""
+    print("| model | its batch | GB |", " | ".join(f"{size} GB" for size in GIGABYTES), "|\n|" + "---|" * 6)
+    for model in models:
+        data, few, slope = measured(model)
+        held, of_batch = few["peak"] / 1e9 + CONTEXT, slope["peak"] / 1e9
+        whole = held + (1 - SHARES[0]) * of_batch
+        largest = (batch(data, SHARES[0] + (FREE * size - held) / of_batch) for size in GIGABYTES)
+        print(f"| {model} |", " | ".join((batch(data, 1), f"{whole:.1f}", *largest)), "|", flush=True)
+
+
+def batch(data: Any, share: float) -> str:
+    """Return what decides how much a step takes, for a share of the model's own batch."""
+    samples = data.sample_budget is not None
+    return f"{int((data.sample_budget if samples else data.batch_rays) * share):,} {'samples' if samples else 'rays'}"
+
+
+def measured(model: str) -> tuple[Any, dict[str, int], dict[str, float]]:
+    """Return a model's settings of data, what a small share of its batch asks for, and what a whole one adds."""
+    data = composed("train", f"model={model}").data
+    few, more = (counted(model, data, share) for share in SHARES)
+    return data, few, {key: (more[key] - few[key]) / (SHARES[1] - SHARES[0]) for key in few}
+
+
 def counted(model: str, data: Any, share: float) -> dict[str, int]:
-    """Count the third step of a share of a batch, on a small occupancy grid; kernels do nothing."""
+    """Count the third step of a share of a batch, on a small occupancy grid; kernels do nothing; `peak` is of all."""
     budget = None if data.sample_budget is None else int(data.sample_budget * share)
     changes = [f"data.batch_rays={int(data.batch_rays * share)}", f"data.sample_budget={budget or 'null'}"]
     changes += [each for each in small(model) if "sampler.resolution" in each]
-    with StandInDevice("cuda") as there, Launches(lambda *given, **options: None) as launches:
+    nothing = Launches(lambda *given, **options: None)
+    with PeakBytes("cpu") as memory, StandInDevice("cuda") as there, nothing as launches:
         run = step_by_step(model, there.device, "bf16-mixed", None, *changes)
         for _ in range(3):
             launches.counts.clear()
             run.step()
-        return dict(launches.counts)
+        return launches.counts | {"peak": memory.most}
 
 
 def bound(operations: int, whole: dict[str, float], bandwidth: float, teraflops: float) -> str:
@@ -100,7 +128,7 @@ if __name__ == "__main__":
     what, *named = sys.argv[1:] or [""]
     if what == "kernels":
         kernels(named or list(DEVICES))
-    elif what == "steps":
-        steps(named or [each for each in options("model") if each != "auto" and "transformer" not in each])
+    elif what in ("steps", "memory"):
+        {"steps": steps, "memory": memory}[what](named or [each for each in options("model") if each not in OTHERS])
     else:
         sys.exit(__doc__)
