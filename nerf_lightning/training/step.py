@@ -162,21 +162,22 @@ class TrainStep:
         learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
         decides = ["refinement" if name == "rays" else name for name in learnt]
         decides += ["a penalty"] if any(part.penalty() is not None for part in self._parts()) else []
-        decides += ["loss"] if list(self.loss.buffers()) else []
+        decides += ["loss"] if self.loss.buffers_to_average() else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
         if not self.model.replays or decides:
             cause = f"and here are: {', '.join(decides)}" if decides else "and this model has others"
             raise InputError(
-                "trainer.cuda_graph=true replays the same kernels in each step: it is for models with an occupancy "
-                "grid (model=fast), without refinement, correction, model.subpixels, encoder.blend_in, and losses that "
-                f"learn, {cause}. Leave it out."
+                "trainer.cuda_graph=true replays the same kernels in each step: it is for models without refinement, "
+                f"correction, model.subpixels, encoder.blend_in, and losses that learn, {cause}. Leave it out."
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
             return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
 
-        self._recorded = RecordedGradients(compute, self._parameters(), self.model.sample_counts, record)
+        self._recorded = RecordedGradients(
+            compute, self._parameters(), self.model.sample_counts, lambda: self.model.step_variant, record
+        )
 
     @property
     def rays_together(self) -> int:

@@ -33,6 +33,7 @@ class DenseLevel(Level):
 
     sampler: DenseSampler
     sampler_kind = DenseSampler
+    replays = True
 
     def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
         super().__init__(sampler, field)
