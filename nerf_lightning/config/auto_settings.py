@@ -117,9 +117,7 @@ def _for_gpu(model: str, overrides: Sequence[str], on_gpu: bool, former: Mapping
     larger = [f"{key}={value}" for key, value in batches.items() if key not in typed]
     if not on_gpu or not larger:
         return []
-    log.info(
-        "batches: about 2^18 samples a step, since a GPU computes (%s; other numbers choose others)", ", ".join(larger)
-    )
+    log.info("batches: about 2^18 samples a step, as suits a GPU (%s)", ", ".join(larger))
     return larger
 
 

@@ -46,18 +46,18 @@ def test_a_gpu_that_cannot_be_used_leaves_the_work_to_the_cpu_unless_it_was_aske
 
 
 def test_a_driver_that_is_too_old_is_named(monkeypatch, caplog):
-    old = "The NVIDIA driver on your system is too old (found version 11040)."
+    old = "The NVIDIA driver on your system is too old (found version 11040)"
 
     def is_available():
-        warnings.warn(f"CUDA initialization: {old}", UserWarning, stacklevel=1)
+        warnings.warn(f"CUDA initialization: {old}.", UserWarning, stacklevel=1)
         return False
 
     monkeypatch.setattr(torch.cuda, "is_available", is_available)
     with pytest.raises(InputError, match="torch sees no CUDA device here") as refused:
         devices.choose_device("gpu")
-    assert f"({old})" in str(refused.value)
+    assert f"here. {old}. Use trainer=cpu" in str(refused.value)
     assert devices.choose_device("auto") == ("cpu", "no GPU found")
-    assert caplog.messages == [f"The CPU computes, since torch cannot use the GPU here: {old}"]
+    assert caplog.messages == [f"The CPU computes, since torch cannot use the GPU here: {old}."]
 
 
 def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_name(monkeypatch):
