@@ -55,8 +55,8 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
     reason = " ".join(str(told[-1].message).split())[:200].removeprefix("CUDA initialization: ") if told else ""
     if accelerator == "gpu":
         raise InputError(
-            f"trainer=gpu: torch sees no CUDA device here. {reason}{' ' if reason else ''}Use trainer=cpu or trainer=auto, "
-            "or install a CUDA build of torch that suits the driver, which nvidia-smi shows."
+            f"trainer=gpu: torch sees no CUDA device here. {reason}{' ' if reason else ''}Use trainer=cpu or "
+            "trainer=auto, or install a CUDA build of torch that suits the driver, which nvidia-smi shows."
         )
     if reason:
         log.warning("The CPU computes, since torch cannot use the GPU here: %s", reason)
