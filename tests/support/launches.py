@@ -45,13 +45,15 @@ class Launches(TorchDispatchMode):
         self.launch, self.computes = launch or KERNEL.run, launch is None
 
     def __enter__(self) -> Self:
-        self._run = KERNEL.run
+        self._run, self._try = KERNEL.run, backends._try
+        if not self.computes:  # a trial of kernels looks at numbers
+            backends._try = lambda module: None
         KERNEL.run = lambda kernel, *args, **options: self._launched(kernel, *args, **options)
         return super().__enter__()
 
     def __exit__(self, *raised: Any) -> None:
         super().__exit__(*raised)
-        KERNEL.run = self._run
+        KERNEL.run, backends._try = self._run, self._try
 
     def _launched(self, kernel: Any, *args: Any, **options: Any) -> None:
         self.counts.update(kernels=1, bytes=_bytes([*args, *options.values()]))
