@@ -3,7 +3,6 @@
 Three steps of each model, every kernel of triton's in its place, through triton's interpreter.
 """
 
-import functools
 import json
 import os
 import subprocess
@@ -28,32 +27,20 @@ CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) 
 TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}
 
 
-@functools.cache
-def measured(*cases):
-    """In a process of their own: the interpreter is chosen when the kernels are defined."""
+def measured(case):
+    """In a process of its own: the interpreter is chosen when the kernels are defined."""
     environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
-    command = [sys.executable, "-m", "support.launches", *cases]
+    command = [sys.executable, "-m", "support.launches", case]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
+    return json.loads(result.stdout)[case]
 
 
-def found(case):
-    return measured(*(QUICK if case in QUICK else [case]))[case]
-
-
-@pytest.mark.xdist_group("launches")
 @pytest.mark.parametrize("case", CASES)
-def test_a_step_asks_for_no_more_than_it_did(case):
-    step, tile = found(case)["step"], found(case)["tile"]
-    counted = *(each["operations"] + each["kernels"] for each in (step, tile)), step["host"]
+def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
+    found, precision = measured(case), case.split(",")[1]
+    assert found["step"]["kernels"] > 0
+    assert found["losses"] == pytest.approx(found["without"], rel=TOLERANCE[precision])
+    counted = *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "tile")), found["step"]["host"]
     print(f'    "{case}": {counted},')  # pytest -rP shows the table anew
     assert all(asked <= budget for asked, budget in zip(counted, BUDGETS[case], strict=True)), (counted, BUDGETS[case])
-
-
-@pytest.mark.xdist_group("launches")
-@pytest.mark.parametrize("case", CASES)
-def test_kernels_learn_what_torch_does(case):
-    seen, precision = found(case), case.split(",")[1]
-    assert seen["step"]["kernels"] > 0
-    assert seen["losses"] == pytest.approx(seen["without"], rel=TOLERANCE[precision])
