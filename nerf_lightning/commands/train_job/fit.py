@@ -44,6 +44,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
     except RuntimeError as error:
         if not is_device_failure(error):
             raise
+        trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
         raise InputError(
             f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
             f"{_what_is_left(folder)} If it fails again, nerf selftest tells whether the GPU computes right, and "
