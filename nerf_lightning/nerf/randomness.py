@@ -127,7 +127,7 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     columns = -(-size // rows)
     kernels = cpu_backend("random.cpu", index.device) if key.numel() == 1 and index.dim() == 1 else None
     if kernels is not None:
-        return kernels.permute(index, rows, columns, size, _round_words(key.view(())))
+        return kernels.permute(index, rows, columns, size, _round_words(int(key)))
     position = _feistel(index, rows, columns, key)
     while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
         position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
@@ -145,7 +145,6 @@ def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
     return row * columns + column
 
 
-def _round_words(key: Int[Tensor, "*n"]) -> Int[Tensor, "rounds *n"]:
+def _round_words(key: Word) -> list[Word]:
     # As many words as there are keys: a batch that lies in one epoch has one.
-    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
-    return mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)
+    return [mix((key + number * 0x1B873593) & WORD) for number in range(FEISTEL_ROUNDS)]

@@ -6,6 +6,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import torch
+from support.triton_batches import check_pixels, check_rays  # noqa: F401 -- check_all finds them by name
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
@@ -28,8 +29,8 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 SMALL = [name for name in backends.CUDA_BACKENDS if name not in ("hash_grid.cuda", "mlp.cuda")]
 
 
-def check_all(device, generator, rays=70):
-    for name in SMALL:
+def check_all(device, generator, rays=70, names=SMALL):
+    for name in names:
         kernels = importlib.import_module(f"{backends.KERNELS}.{name}")
         with forced():
             kernels.trial(device)
@@ -45,15 +46,24 @@ def check_random(kernels, device, generator, rays):
 
 
 def check_adam(kernels, device, generator, rays):
-    """Where the gradient is zero nothing changes; NaN counts as touched."""
-    given = torch.randn(4, 1300, generator=generator).to(device)
-    given[1][::3], given[3] = 0.0, given[3].square()
-    expected, found = given.double(), given.clone()
-    for step in (expected, found):
-        numbers = 1e-2, 1.3, (0.9, 0.99), 1e-15
-        (adam_step_torch if step is expected else kernels.adam_step)(*step, *numbers)
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
-    assert torch.equal(found[:, ::3][[0, 2, 3]], given[:, ::3][[0, 2, 3]])
+    """Of several parameters at once; where the gradient is zero nothing changes; NaN counts as touched."""
+    found = []
+    for count in (1300, 1, 0, 1024):
+        rows = torch.randn(4, count, generator=generator).to(device)
+        rows[1][::3], rows[3] = 0.0, rows[3].square()
+        found.append(rows)
+    found[0][1, 4] = torch.nan
+    given = [rows.clone() for rows in found]
+    numbers = 1e-2, 1.3, (0.9, 0.99), 1e-15
+    for _ in range(2):  # the second finds the addresses known
+        kernels.adam_steps([rows.unbind() for rows in found], *numbers)
+        assert not any(rows[1].any() for rows in found)
+        for rows, before in zip(found, given, strict=True):
+            expected = before.double()
+            adam_step_torch(*expected, *numbers)
+            torch.testing.assert_close(rows.double(), expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+            assert torch.equal(rows[:, ::3][[0, 2, 3]], before[:, ::3][[0, 2, 3]])
+            rows.copy_(before)
 
 
 def check_spherical_harmonics(kernels, device, generator, rays):

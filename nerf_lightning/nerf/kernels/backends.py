@@ -29,9 +29,10 @@ CPU_BACKENDS = (
 """The modules that numba compiles."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
-    *("render.cuda", "histograms.cuda", "adam.cuda"),
+    *("render.cuda", "histograms.cuda", "adam.cuda", "pixels.cuda", "rays.cuda"),
 )
 """The modules that triton compiles."""
+FP_FUSION = "TRITON_DEFAULT_FP_FUSION"
 LONG_SECONDS = 2.0
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
@@ -53,6 +54,8 @@ def backend(module: str) -> ModuleType | None:
     try:
         if library == "numba":
             _configure_numba()
+        else:  # products and sums in one rounding, which triton warns of where nobody has said so
+            os.environ.setdefault(FP_FUSION, "1")
         found = _imported(module)
         if library == "numba":
             _stamp_with_sources(found)

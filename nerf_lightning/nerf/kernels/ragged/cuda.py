@@ -10,7 +10,7 @@ from typing import no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from nerf_lightning.nerf.types.rays import RaggedSamples
@@ -21,9 +21,9 @@ BLOCK = 32
 def integrate(
     density: Float[Tensor, "n"],
     rgb: Float[Tensor, "n 3"],
-    starts: Float[Tensor, "n"],
-    ends: Float[Tensor, "n"],
-    bounds: Int[Tensor, "bounds"],
+    starts: Float[Tensor, "starts"],
+    ends: Float[Tensor, "ends"],
+    bounds: Shaped[Tensor, "bounds"],
     each: int = 0,
     closed: bool = False,
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "n"]]:
@@ -32,8 +32,8 @@ def integrate(
     Args:
         density: per unit length.
         rgb: in [0, 1].
-        starts: where each interval begins.
-        ends: where it ends.
+        starts: where each interval begins; of rays with as many samples each, all fenceposts.
+        ends: where it ends; the same from the second on.
         bounds: the samples of ray r are those from bounds[r] to bounds[r + 1].
         each: samples of every ray, where there are no bounds; 0: as the bounds say.
         closed: whether the last sample of a ray takes all the light that is left.
@@ -51,9 +51,9 @@ def integrate(
 def integrate_gradient(
     density: Float[Tensor, "n"],
     rgb: Float[Tensor, "n 3"],
-    starts: Float[Tensor, "n"],
-    ends: Float[Tensor, "n"],
-    bounds: Int[Tensor, "bounds"],
+    starts: Float[Tensor, "starts"],
+    ends: Float[Tensor, "ends"],
+    bounds: Shaped[Tensor, "bounds"],
     weights: Float[Tensor, "n"],
     of_foreground: Float[Tensor, "rays 3"],
     of_opacity: Float[Tensor, "rays"],
