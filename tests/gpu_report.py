@@ -22,6 +22,7 @@ from support.launches import KERNEL, Launches
 from support.stand_in_device import StandInDevice
 
 from nerf_lightning.commands.train_job.memory_trial import PeakBytes
+from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 
 OTHERS = ("auto", "view_transformer", "view_transformer_tiny")
 COMPILED = ("fast", "fast_proposal")
@@ -114,7 +115,10 @@ def counted(model: str, data: Any, share: float) -> dict[str, int]:
         for _ in range(3):
             launches.counts.clear()
             run.step()
-        return launches.counts | {"peak": memory.most}
+        learnt = [each for group in run.optimizer.param_groups for each in group["params"]]
+        if isinstance(run.optimizer, TableAdam):  # its kernel is given addresses: of weights, gradients and moments
+            launches.counts["bytes"] += 4 * sum(each.nbytes for each in learnt)
+        return dict(launches.counts, peak=memory.most)
 
 
 def bound(operations: int, whole: dict[str, float], bandwidth: float, teraflops: float) -> str:
