@@ -94,7 +94,8 @@ def memory(models: list[str]) -> None:
 def batch(data: Any, share: float) -> str:
     """Return what decides how much a step takes, for a share of the model's own batch."""
     samples = data.sample_budget is not None
-    return f"{int((data.sample_budget if samples else data.batch_rays) * share):,} {'samples' if samples else 'rays'}"
+    count = (data.sample_budget if samples else data.batch_rays) * share
+    return f"{count if share == 1 else float(f'{count:.2g}'):,.0f} {'samples' if samples else 'rays'}"
 
 
 def measured(model: str) -> tuple[Any, dict[str, int], dict[str, float]]:
