@@ -14,9 +14,9 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.lenses import NEWTON_STEPS
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, LensModel
 
-LENSES = ("pinhole", "radial_tangential")
+LENSES: tuple[LensModel, ...] = ("pinhole", "radial_tangential")
 BLOCK = 128
 
 
