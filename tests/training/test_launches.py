@@ -14,12 +14,12 @@ pytest.importorskip("triton", reason="triton is not installed (Linux only)")
 
 BUDGETS = {
     # On the device (operations and kernels): a step, a rendered tile. On the host: a step.
-    "fast_small,bf16-mixed": (250, 265, 32),
-    "fast_proposal,bf16-mixed": (351, 96, 32),
-    "nerf_tiny,bf16-mixed": (466, 130, 34),
-    "fast,bf16-mixed": (0, 0, 0),
-    "fast,32-true": (0, 0, 0),
-    "fast_proposal,32-true": (0, 0, 0),
+    "fast_small,bf16-mixed": (83, 38, 7),
+    "fast_proposal,bf16-mixed": (132, 41, 7),
+    "nerf_tiny,bf16-mixed": (312, 130, 7),
+    "fast,bf16-mixed": (83, 38, 7),
+    "fast,32-true": (93, 42, 7),
+    "fast_proposal,32-true": (152, 41, 7),
 }
 QUICK = list(BUDGETS)[:3]
 CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
