@@ -21,7 +21,10 @@ suppress_warnings = ["myst.xref_missing"]
 # Tests run the notebooks; here they are shown as they are.
 nb_execution_mode = "off"
 autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
+maximum_signature_line_length = 100
 # Docstrings write `code` as Markdown does.
 default_role = "code"
 

@@ -17,7 +17,8 @@ ELSEWHERE = {ROOT / f"{name}.md": name.lower() for name in ("SECURITY", "CONTRIB
     page: f"extension_{page.parent.name}" for page in sorted((ROOT / "nerf_lightning/extensions").glob("*/README.md"))
 }
 """Documents outside of docs/, and the names of their pages in the site."""
-WRITTEN_BY_SPHINX = {"Reference": ["settings", "api"]}
+WITHOUT_LINKS = {"Concepts": [name for name in ELSEWHERE.values() if "_" in name], "Reference": ["settings", "api"]}
+"""Pages at the end of a section that docs/README.md does not link."""
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)\s#]+)")
 LIBRARY = {
     "From a pixel to a ray": [
@@ -27,7 +28,11 @@ LIBRARY = {
         "geometry.contraction.contract",
         "types.rays.RayBundle",
     ],
-    "Samplers": ["samplers.base.Sampler", "samplers.stratified.StratifiedSampler", "samplers.importance.ImportanceSampler"],
+    "Samplers": [
+        "samplers.base.Sampler",
+        "samplers.stratified.StratifiedSampler",
+        "samplers.importance.ImportanceSampler",
+    ],
     "Encoders and fields": [
         "encoders.base.Encoder",
         "encoders.base.ConeEncoder",
@@ -74,12 +79,12 @@ def _index() -> Iterator[str]:
     yield introduction
     for section in sections:
         caption, _, links = section.partition("\n")
-        pages = [os.path.splitext(page)[0] for page in LINK.findall(links)] + WRITTEN_BY_SPHINX.get(caption, [])
+        pages = [os.path.splitext(page)[0] for page in LINK.findall(links)] + WITHOUT_LINKS.get(caption, [])
         yield from ("```{toctree}", f":caption: {caption}", ":maxdepth: 1", "", *pages, "```", "")
 
 
 def _api() -> Iterator[str]:
-    yield "# API\n\nShapes are in the annotations: `Float[Tensor, \"*rays 3\"]` is any number of rays by 3.\n"
+    yield '# API\n\nShapes are in the annotations: `Float[Tensor, "*rays 3"]` is any number of rays by 3.\n'
     yield "## nerf_lightning\n"
     names = getattr(nerf_lightning, "__all__", nerf_lightning._OFFERED)
     yield from (_documented(f"nerf_lightning.{name}", getattr(nerf_lightning, name)) for name in sorted(names))

@@ -52,9 +52,9 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        ("fog", "\n  * The training was short: fog"),
-        ("blurry", "Blurred, though it trained long enough"),
-        ("grey", "The picture is grey"),
+        ("fog", "\n  * Fog disappears last"),
+        ("blurry", "Blurred, although it trained long enough"),
+        ("gray", "The picture is gray"),
         ("gpu", "\n  trainer=gpu  "),
         ("learning rate", "  optimizer.lr  "),
         ("batch size", "  data.batch_rays  "),
