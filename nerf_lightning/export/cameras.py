@@ -43,11 +43,11 @@ class CamerasExport(Export):
     """Write where the photographs were taken, and through what lens.
 
     Args:
-        images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
-        format: `transforms` writes `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the
-            pictures of the training; `nerfstudio` `camera_path.json`, a film of the photographs for `ns-render
-            camera-path`; `blender` `cameras_blender.py`, which makes the same film's keyframes when Blender runs it.
-        fps: photographs per second of such a film.
+        images: folder of the photographs, relative to the JSON file, prefixed to each name; None: the recorded names.
+        format: `transforms` writes `transforms`.json (`nerfstudio`) and `sparse/0` (COLMAP, text) of the images as
+            trained on; `nerfstudio` writes `camera_path.json`, an animation through the photographs for `ns-render
+            camera-path`; `blender` writes `cameras_blender.py`, which creates the same animation in Blender.
+        fps: photographs per second of such an animation.
     """
 
     needs_density = False

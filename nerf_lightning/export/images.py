@@ -45,8 +45,8 @@ class ImagesExport(Export):
     something lies further away than these reach.
 
     Args:
-        split: whose views are shown.
-        max_views: most of them, spread over all; None: all.
+        split: the split whose views are exported.
+        max_views: maximum number of views, spread over all; None: all.
         depth: `distance` along the pixel's ray, or `z` along the camera's axis.
     """
 

@@ -40,12 +40,12 @@ class PageExport(Export):
 
     Args:
         quality: about 3, 10 or 30 MB.
-        resolution: voxels along the longest side of what there is; in scenes without bounds three quarters of them lie
-            along the side of the box, and as many around it. None: as the quality has it.
-        photographs: most photographs that are places to jump to, spread over all; 0: none.
-        max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
-        fit_steps: so many steps move the bytes towards the photographs that the model learnt from; 0: they stay as
-            baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
+        resolution: voxels along the longest side of the content; in unbounded scenes, three quarters of them lie along
+            the side of the box, and as many around it. None: as the quality.
+        photographs: maximum number of photographs to jump to, spread over all; 0: none.
+        max_views: maximum number of test views on which the page is compared with the model; 0: none.
+        fit_steps: steps that fit the voxels to the training photographs; 0: as baked, as also without photographs, or
+            if the model has a correction per photograph.
     """
 
     needs_photographs = True

@@ -44,13 +44,13 @@ class PointsExport(Export):
     Points that other views do not confirm are left out.
 
     Args:
-        num_points: most points; of more, some are drawn.
-        max_views: most training views that are rendered.
-        longest: pixels of the longer side of what is rendered, at most.
-        min_opacity: share of the light that a pixel must stop.
-        agreement: how many of the nearest 8 other views must see the same surface.
-        tolerance: share of the distance by which their depths may differ.
-        format: of the file; PLY has normals; LAS (1.2, point format 2) is what programs for surveys read, has none, and
+        num_points: maximum number of points, which are drawn at random if there are more.
+        max_views: maximum number of training views to render.
+        longest: maximum length of the longer side of renders, in pixels.
+        min_opacity: minimum opacity of a pixel.
+        agreement: how many of the 8 nearest views must see the same surface.
+        tolerance: maximum relative difference of their depths.
+        format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without, which
             needs `pip install 'nerf-lightning[las]'`.
     """
 

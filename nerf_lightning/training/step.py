@@ -90,7 +90,7 @@ class TrainStep:
         seed: the run's seed.
         background: what lies behind the training rays.
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
-        clip_norm: gradients are scaled down to this norm; None leaves them.
+        clip_norm: maximum norm of the gradient, to which larger ones are scaled down; None: no clipping.
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.

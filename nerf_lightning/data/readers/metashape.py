@@ -54,7 +54,7 @@ class MetashapeReader(CaptureReader):
     """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
 
     Args:
-        file: the xml below root; null: the only one there.
+        file: the XML file below root; null: the only one there.
     """
 
     name: str = "metashape"

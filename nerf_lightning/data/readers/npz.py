@@ -43,9 +43,9 @@ class NpzReader(GivenFrameReader):
     Args:
         path: the .npz file.
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
-        train_fraction: with `hold_every` 0, the share of the views, from the first on, to learn from.
-        download: where to get an absent file: `url`, `bytes` and `sha256` (None: only its size is checked).
-        max_gigabytes: how much the file may unpack to; what is small on the disk may be made to fill the memory.
+        train_fraction: with `hold_every` 0, the share of the views, from the first on, used for training.
+        download: where to download a missing file: `url`, `bytes` and `sha256` (None: only its size is checked).
+        max_gigabytes: the maximum unpacked size; a small file can be made to fill the memory.
     """
 
     path: str

@@ -23,7 +23,7 @@ class PolycamReader(CaptureReader):
     """Read the raw data that Polycam exports in its developer mode. Units are metres; y is up.
 
     Args:
-        depth_unit: length of a level of the 16-bit depth maps, in metres.
+        depth_unit: length of one level of the 16-bit depth maps, in meters.
     """
 
     name: str = "polycam"

@@ -42,9 +42,9 @@ class TransformsReader(CaptureReader):
     """Read a transforms.json; intrinsics may stand at the top, for all views, or in a frame.
 
     Args:
-        file: the json below root; the paths in it are relative to where it lies. null: transforms.json, or all files
-            transforms_*.json as one capture, whose splits those of train, val and test are.
-        depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
+        file: the JSON file below root; paths in it are relative to its folder. null: transforms.json, or all
+            transforms_*.json as one capture, whose splits are train, val and test.
+        depth_unit: length of one level of the 16-bit depth maps (`depth_file_path`), in the capture's units.
     """
 
     name: str = "transforms"

@@ -29,10 +29,10 @@ class PhotosReader(AutoReader):
     """Read photographs whose cameras nobody knows yet; a folder of a known format is read as what it is.
 
     Args:
-        root: the folder of the photographs; they lie in it, or in `images` below it.
-        video: a video, in place of root.
-        panoramas: whether the pictures are equirectangular panoramas of all directions; auto: where they say so, or
-            all are exactly twice as wide as high.
+        root: the folder of the photographs, or the parent of a folder `images`.
+        video: a video instead of root.
+        panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
+            as wide as high.
     """
 
     root: str | None = None  # type: ignore[assignment]

@@ -28,9 +28,10 @@ class HybridEncoder(ConeEncoder):
     Args:
         coarse: features of the coarse scales, gamma.
         fine: hash grid of the fine scales, h; None: there is none.
-        factor: what the coarse features are multiplied with: `learnt` as above; `one` leaves them as they are.
+        factor: the factor of the coarse features: `learnt` as above; `one` leaves them unchanged.
         width: width of the two hidden layers of the factor's MLP.
-        cones: whether the factor also sees the covariance of the pixel's cone, in squares of the grid's finest cell.
+        cones: whether the factor also depends on the covariance of the pixel's cone, in squares of the grid's finest
+            cell.
 
     Raises:
         ValueError: a factor is to be learnt where there is no grid to learn it from, or cones where it is not learnt.

@@ -20,8 +20,8 @@ class Exposure(Correction):
     over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
 
     Args:
-        learning_rate: of the stops; Adam moves each by at most about so much in a step.
-        mean_weight: factor on the sum of the squared means, which is added to the loss.
+        learning_rate: learning rate of the exposures, in stops; Adam changes each by at most about this per step.
+        mean_weight: weight of the sum of the squared means in the loss.
     """
 
     trained: Tensor

@@ -27,15 +27,15 @@ class NerfMLP(Field):
         position_encoder: features of positions, gamma(x).
         direction_encoder: features of directions, gamma(d).
         depth: number of trunk layers.
-        width: width of the trunk and of the feature; the colour head has half of it.
+        width: width of the trunk and of the feature; the color head has half of it.
         skip: index of the trunk layer (counted from 0) whose input is joined by the encoded position again; the
             paper's is 5, after the layer at index 4. None for no skip.
-        density_activation: relu as in the paper, or softplus, which cannot die.
+        density_activation: relu as in the paper, or softplus, whose gradient never vanishes.
         density_bias: added to the raw density before its activation; negative values start from empty space.
-        density_noise: standard deviation of the normal noise added to the raw density while training.
-        xavier: Glorot uniform weights and zero biases, as Keras has them; False for torch's own start.
-        contraction: see all space contracted around the scene's box into a ball of radius 2; None: as the scene's
-            space. Otherwise positions enter as they are, as in the paper.
+        density_noise: standard deviation of the Gaussian noise added to the raw density in training.
+        xavier: Glorot uniform weights and zero biases, as in Keras; False: PyTorch's own initialization.
+        contraction: contract all space around the scene's box into a ball of radius 2; None: as the scene's space.
+            Otherwise positions enter unchanged, as in the paper.
     """
 
     aabb: Tensor

@@ -36,15 +36,15 @@ class NGPField(Field):
         position_encoder: features of points in the unit cube.
         direction_encoder: features of unit directions.
         width: width of every hidden layer.
-        feature_dim: what the density's MLP hands to the colour's, the raw density included.
-        color_layers: hidden layers of the colour's MLP. Two as in arXiv 2201.05989; one is a tenth quicker, as sharp
-            after a minute of training on two cores, and less so after many.
-        density_bias: added to the raw density, before the exponential. None: thick (3) where the photographs have
-            alpha, which tells at once where nothing is, and thin (-1) where they have none: there a dense start would
-            remain as fog of the background's colour.
-        contraction: map all space, contracted around the box, instead of the box alone; None: as the scene's space.
-        appearance: numbers of a code that each photograph has, and that its colours depend on (Sec. 4.1, arXiv
-            2008.02268); 0: none. What is seen without a photograph has the mean code of those that train.
+        feature_dim: outputs of the density MLP that the color MLP receives, including the raw density.
+        color_layers: hidden layers of the color MLP. Two as in arXiv 2201.05989; one is a tenth faster, as sharp after
+            a minute of training on two cores, and less sharp after many.
+        density_bias: added to the raw density before the exponential. None: dense (3) if the photographs have alpha,
+            which shows early what is empty, and thin (-1) otherwise, because a dense start would remain as fog in the
+            background's color.
+        contraction: map all space, contracted around the box, instead of only the box; None: as the scene's space.
+        appearance: size of the appearance embedding of each photograph (Sec. 4.1, arXiv 2008.02268); 0: none. New views
+            use the mean embedding of the training photographs.
     """
 
     compiles = False

@@ -25,8 +25,8 @@ class ProposalLoss(Loss):
     the Charbonnier loss.
 
     Args:
-        interlevel: factor on the interlevel losses; the proposals learn from nothing else, so it hardly matters.
-        distortion: factor on the distortion loss; larger values remove fog and floaters, too large ones detail.
+        interlevel: factor on the interlevel losses; it hardly matters, because proposals learn from nothing else.
+        distortion: factor on the distortion loss; larger values remove fog and floaters, and too large ones detail.
     """
 
     needs_weights = True

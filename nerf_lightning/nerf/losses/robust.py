@@ -36,11 +36,11 @@ class RobustLoss(Loss):
     below at any time, and steps that see more places.
 
     Args:
-        of: the loss that the others count in, for all its levels.
-        share: least share of the pixels that surely show the scene. Less trims more: passers-by faster, fine detail
-            later. It must exceed the share of a plain background, whose residuals are 0 and say nothing of the scene.
-        times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
-        patch: side of the squares in pixels.
+        of: the loss of the remaining pixels, for all levels.
+        share: the minimum share of pixels that show the static scene. A smaller share trims more: passers-by sooner,
+            fine detail later. It must exceed the share of a plain background, whose residuals are 0.
+        times: the threshold, in units of that quantile (of squared errors: 4 is twice the distance of colors).
+        patch: side of the patches in pixels.
 
     Raises:
         ValueError: a number out of its range.

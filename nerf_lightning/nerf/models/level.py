@@ -21,7 +21,7 @@ class Level(nn.Module):
 
     Args:
         sampler: where the field is asked.
-        field: density and colour.
+        field: density and color.
     """
 
     sampler: Sampler

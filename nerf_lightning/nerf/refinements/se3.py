@@ -37,13 +37,12 @@ class SE3Delta(Refinement):
     them from drifting that way.
 
     Args:
-        poses: learn how each camera turns and shifts (w and t).
-        focal: learn the focal length of each camera (g).
-        lens: learn the radial coefficients of each camera's lens (h1 and h2).
-        learning_rate: of all of them, at the beginning; the run's schedule scales it.
-        hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
-            would only wander.
-        weight: factor on the penalty, the sum of the squares of all of these over the number of photographs.
+        poses: refine the rotation and translation of each camera (w and t).
+        focal: refine the focal length of each camera (g).
+        lens: refine the radial coefficients of each camera's lens (h1 and h2).
+        learning_rate: the initial learning rate of all of them; the run's schedule scales it.
+        hold: share of the run in which cameras are fixed: without a scene to align to, they would drift.
+        weight: weight of the penalty: the sum of squares of all of these, divided by the number of photographs.
     """
 
     extent: Tensor

@@ -21,7 +21,7 @@ class Monitor(Watcher):
     They go straight to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
-        every_steps: steps between two rows.
+        every_steps: steps between two points of the curves.
     """
 
     def __init__(self, every_steps: int = 50):

@@ -26,8 +26,8 @@ class RayHistograms(Watcher):
     or the far bound, which then cut the scene.
 
     Args:
-        every_steps: steps between two looks.
-        num_rays: how many of the rays of a step are looked along.
+        every_steps: steps between two histograms.
+        num_rays: number of rays of a step that are used.
     """
 
     def __init__(self, every_steps: int = 250, num_rays: int = 256):

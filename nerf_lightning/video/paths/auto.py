@@ -20,8 +20,8 @@ class AutoPath(CameraPath):
     """A sweep along the photographs, or a spiral in front of what faces them.
 
     Args:
-        longest: where neither width nor height is given, the picture is as large as the photographs, but its longer
-            side has at most so many pixels: a film of photographs at full size takes hours.
+        longest: without width and height, the maximum length of the longer side, in pixels; otherwise images are as
+            large as the photographs. Films at full size take hours.
     """
 
     num_frames: int = 150

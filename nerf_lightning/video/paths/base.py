@@ -127,11 +127,11 @@ class CameraPath(ABC):
     """A path of virtual cameras for a video; a subclass adds the settings of its own.
 
     Args:
-        num_frames: how many cameras.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second at which the path is meant to be played.
+        num_frames: number of cameras.
+        width: image width in pixels; None: from the height, or as the photographs.
+        height: image height in pixels; None: from the width, or as the photographs.
+        fov: horizontal field of view in degrees; None: as the photographs.
+        fps: frames per second.
     """
 
     num_frames: int = 120

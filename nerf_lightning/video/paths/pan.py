@@ -20,10 +20,10 @@ class Pan(CameraPath):
     """Turn about the vertical, from the left of where a photograph looks to its right.
 
     Args:
-        view: the photograph to begin from: its name, or its number from 0.
-        position: where to stand instead, [x, y, z] in the capture's own frame, looking at the middle of the scene.
-        sweep: degrees to turn in all; 360 makes a panorama, negative turns to the left.
-        tilt: degrees to look higher than the photograph.
+        view: the photograph to start from: its name, or its number from 0.
+        position: the position instead, [x, y, z] in the capture's own frame, looking at the center of the scene.
+        sweep: total rotation in degrees; 360 makes a panorama, negative turns left.
+        tilt: degrees by which to look higher than the photograph.
     """
 
     view: int | str = 0
@@ -61,10 +61,10 @@ class LookAt(CameraPath):
     """Drive from `start` to `end`, looking at `target`.
 
     Args:
-        num_frames: how many cameras, both ends included; one stays at the start.
+        num_frames: number of cameras, including both ends; one stays at the start.
         start: [x, y, z] in the capture's own frame; None: where the first photograph was taken.
         end: [x, y, z] in the capture's own frame; None: where the last photograph was taken.
-        target: [x, y, z] in the capture's own frame; None: the middle of the scene.
+        target: [x, y, z] in the capture's own frame; None: the center of the scene.
     """
 
     start: list[int | float] | None = None
