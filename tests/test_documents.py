@@ -198,12 +198,17 @@ def test_settings_that_are_named_are_there():
         text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
         for code in re.findall(r"`([^`\n]+)`", text):
             for word in code.split():
-                match = re.fullmatch(r"\+?([a-z_/]+(?:\.[a-z_]+)*)(?:@[\w.]+)?(?:=.*)?", word)
+                match = re.fullmatch(r"([a-z_/]+(?:\.[a-z_]+)*)(?:@[\w.]+)?(?:=.*)?", word)
                 if match is None or ("=" not in word and "." not in word) or "/" in match[1].replace("hydra/", ""):
                     continue
                 key, is_file = match[1], re.search(r"\.(py|md|json|ckpt|csv|mp4|yaml|html|png|log|npy)$", word)
                 is_ours = key.split(".")[0] in {each.split(".")[0] for each in known}
-                if is_ours and not is_file and key not in known and not key.startswith("trainer.lightning."):
+                if (
+                    is_ours
+                    and not is_file
+                    and key not in known
+                    and not key.startswith(("trainer.lightning.", "hydra.searchpath"))
+                ):
                     unknown.append(f"{document.name}: {word}")
     assert not unknown
 

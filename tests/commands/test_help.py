@@ -68,7 +68,7 @@ def test_words_that_name_nothing_are_looked_for_in_meanings_and_symptoms(nerf, w
 def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
     told = nerf("help", "ckpt").out
     assert "nerf eval: ckpt=(required)\n    The run folder or checkpoint to evaluate." in told
-    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to look at." in told
+    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to show." in told
 
 
 @pytest.mark.parametrize(
