@@ -87,7 +87,7 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
         check_scene(record, "The scene")
     except Mismatch as error:
         raise InputError(
-            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Mend the capture, or "
+            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Fix the capture, or "
             "the settings (scene.*, budgets.*)."
         ) from error
     kept = vars(record) | {"cameras": dict(vars(scene.cameras))}

@@ -1,4 +1,4 @@
-"""Make a video of a checkpoint along a camera path."""
+"""Render a video along a camera path."""
 
 from dataclasses import replace
 from typing import Any, cast

@@ -35,7 +35,7 @@ def rigid(evidence: Given) -> Check:
     size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
         cure = "Walk around: depth is seen only from different places. Or the centres were lost in the conversion."
-        return wrong("all cameras stand at one place", cure)
+        return wrong("all cameras are at the same position", cure)
     same = (torch.pdist(c2w.flatten(1)) < 1e-6 * size).sum() if len(c2w) <= 2000 else torch.tensor(0)
     if int(same):
         cure = "Look for photographs that are listed twice, or poses that were copied."
@@ -53,13 +53,13 @@ def common_middle(evidence: Given) -> Check:
     to_middle = focus_point(c2w) - c2w[:, :, 3]
     ahead = float(((to_middle * -c2w[:, :, 2]).sum(dim=-1) > 0).double().mean())
     if ahead >= 0.8:
-        return ok(f"{100 * ahead:.0f} % of the cameras have the place where their axes meet in front")
+        return ok(f"{100 * ahead:.0f} % of the cameras face their common focus point")
     if ahead <= 0.2:
         cure = (
             "If the photographs show one thing from around, negate the second and third column of every rotation; if "
             "they were taken outwards from one place, all is well."
         )
-        message = f"{100 * (1 - ahead):.0f} % of the cameras look away from the place where their axes meet"
+        message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
     cure = "Look at doctor.png: do the cameras face what was photographed? If not, see the check of axes."
     return look(f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
@@ -196,7 +196,7 @@ def coverage(evidence: Evidence) -> Check:
     """Report from where around the middle photographs were taken; a hole in a ring of views is noted."""
     scene = evidence.scene
     if scene.space == "ndc":
-        return ok("forward-facing: new views are good between the cameras, not beside them")
+        return ok("forward-facing: new views are good between the cameras, not outside them")
     azimuth, elevation = directions_seen(scene)
     around, gaps = gaps_around(azimuth)
     widest = float(gaps.max())

@@ -101,7 +101,7 @@ def scale(evidence: Evidence) -> Check:
     away = float((centers - middle).norm(dim=-1).median())
     half = float((scene.aabb[1] - scene.aabb[0]).max()) / 2
     if scene.space != "bounded":
-        return ok(f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours")
+        return ok(f"rescaled internally: one unit is {unit_of(scene.to_user.double()):.3g} capture units")
     inside = ((centers > scene.aabb[0]) & (centers < scene.aabb[1])).all(dim=-1)
     message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
     if bool(inside.float().mean() > 0.3):

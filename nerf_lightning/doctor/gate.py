@@ -35,14 +35,14 @@ def require_sound(scene: Scene) -> list[Check]:
     if wrong:
         first, others = wrong[0], ", ".join(check.name for check in wrong[1:])
         raise InputError(
-            f"The capture {scene.name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}"
-            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all that it sees, in a picture; "
+            f"The capture {scene.name} cannot be trained on. {first.name}: {first.message}. {first.cure}"
+            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all findings, with a figure; "
             "doctor=off trains all the same."
         )
     unknown = [check.name for check in checks if check.verdict == "not judged"]
     left = f"; not judged: {', '.join(unknown)}" if unknown else ""
     count = len(checks) - len(unknown)
-    log.info("doctor: %d checks find nothing wrong%s (doctor=off leaves them out)", count, left)
+    log.info("doctor: %d checks found no problem%s (doctor=off skips them)", count, left)
     return checks
 
 

@@ -36,7 +36,7 @@ def duplicates(evidence: Evidence) -> Check:
     parts = torch.arange(len(flat)).split(rows_at_once(len(flat)))
     same = torch.cat([_pairs_alike(flat, contrast, part) for part in parts])
     if not len(same):
-        return ok("no photograph is there twice")
+        return ok("no duplicate photographs")
     scene = evidence.scene
     held = set(scene.splits["test"]) | set(scene.splits["val"])
     leak = [pair for pair in same.tolist() if (pair[0] in held) != (pair[1] in held)]

@@ -232,7 +232,7 @@ def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -
     if shares[best] < max(given + BETTER, HOPELESS):
         if given < HOPELESS:
             return not_judged("too few details lie where the cameras say, by any reading", DOUBTFUL)
-        return ok(f"{fine}: no other reading fits the pixels better")
+        return ok(f"{fine}: no other convention fits the images better")
     poses, changed = readings[best].change(scene, evidence.matches)
     fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None
     against = agreeing(changed, poses) & ~evidence.agrees

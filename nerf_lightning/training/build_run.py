@@ -116,7 +116,7 @@ def assemble(
         start = read_checkpoint(required_path("init_from", config.init_from))
     step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
-        log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
+        log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch, depth_every=step.loss.depth_every

@@ -236,7 +236,7 @@ class TrainStep:
             return self.build_optimizer(groups)
         except (ValueError, TypeError) as error:  # torch looks at its settings here
             raise InputError(
-                f"The optimizer refuses its settings: {error}. Mend optimizer.*, or leave it out."
+                f"The optimizer refuses its settings: {error}. Fix optimizer.*, or leave it out."
             ) from error
 
     def __call__(
@@ -437,9 +437,7 @@ class TrainStep:
             ) from error
         points = batch.num_rays * self.model.points_per_ray(training=True)
         self.tile_points = int(min(self.tile_points, points)) // 2
-        log.warning(
-            "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
-        )
+        log.warning("out of memory: reducing tiles to %d points and repeating the step", self.tile_points)
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         """Return how many of so many pixels are rendered at once."""

@@ -94,7 +94,7 @@ def film_steps(
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         if "depth" in settings.outputs and ranks.is_first():
-            log.info("depth is in %s, and most of it lies from %.3g to %.3g", told_length(first)[1], *seen)
+            log.info("depth is in %s, mostly from %.3g to %.3g", told_length(first)[1], *seen)
         mine = ranks.every_other(missing)
         yield 0, len(mine)
         for done, number in enumerate(mine, start=1):

@@ -77,7 +77,7 @@ class FilmFrames:
         missing = [number for number in range(self.count) if not self._is_there(number)]
         if len(missing) < self.count:
             there = self.count - len(missing)
-            log.info("%d of %d frames are there already: the missing ones follow", there, self.count)
+            log.info("%d of %d frames exist already: rendering the missing ones", there, self.count)
         near, far = note["depth_range"]
         return missing, (near, far)
 

@@ -63,7 +63,7 @@ class FilmPanel:
 
     def give_up(self) -> None:
         """Make no film: a frame could not be rendered."""
-        self._fail(InputError("The film could not be rendered: what went wrong stands where nerf was started."))
+        self._fail(InputError("The film could not be rendered: the terminal of nerf shows the error."))
 
     def work(self, renderer: SlicedRenderer) -> bool:
         """Render a frame; return False where nothing is left to do here."""

@@ -50,7 +50,7 @@ def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(key, ner
         result = nerf(*begun, "resume_changed_capture=true")
         assert result.code == 0, result.err
         assert WHAT[key] in result.out + result.err
-        assert "going on from step 6" in result.out + result.err
+        assert "resuming from step 6" in result.out + result.err
 
 
 WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}

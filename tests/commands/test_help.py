@@ -32,7 +32,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     result = nerf("help", "data.sample_budget")
     assert result.code == 0
     assert result.out.startswith("data.sample_budget=131072\n")
-    assert "so that a step has about so many samples; null: they do not." in " ".join(result.out.split())
+    assert "The target number of samples per step" in " ".join(result.out.split())
     assert "Takes int | null." in result.out
     assert "model=fast_large 524288" in " ".join(result.out.split())
     result = nerf("train", "--help", "scene=colmap")
@@ -45,7 +45,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert nerf("help", "export").out == nerf("export", "--help").out
     assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
-    assert "in the user's units; null: from the capture." in told
+    assert "in the capture's units; null: from the capture." in told
     assert "With scene=blender" in told
 
 

@@ -38,7 +38,7 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     assert choices["model"] == model
     assert (config.data.batch_rays, config.seed) == (batch_rays, 3)
     assert f"model: {model}, since " in caplog.text
-    assert "(model=NAME chooses another)" in caplog.text
+    assert "(choose another with model=NAME)" in caplog.text
 
 
 def with_depths(scene, distance=1.0):

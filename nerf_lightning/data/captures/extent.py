@@ -76,7 +76,7 @@ def choose_space(
         return "ndc", "since all cameras look the same way and the capture gives depths"
     if ahead and cosine > FORWARD_FACING and len(capture.points):
         return "ndc", "since all cameras look the same way and sparse points give depths"
-    return "contracted", "since the photographs show whatever lies behind the content"
+    return "contracted", "since the photographs show a background"
 
 
 def least_ahead(cameras: Cameras) -> float:
@@ -106,7 +106,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     the user knows better.
 
     Raises:
-        InputError: all cameras stand at one place, near and far leave nothing, or the space does not suit the cameras.
+        InputError: all cameras are at one position, near and far leave nothing, or the space does not suit the cameras.
     """
     _check_places(capture, cameras)
     if space == "ndc":
@@ -156,7 +156,7 @@ def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Cap
     if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
         raise InputError(
             f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "
-            "is so small or so large. Mend applied_scale and applied_transform, or the cameras' distances."
+            "is so small or so large. Fix applied_scale and applied_transform, or the cameras' distances."
         )
 
 
@@ -177,8 +177,8 @@ def _check_places(capture: Capture, cameras: Cameras) -> None:
     spread = (centers - centers.mean(dim=0)).abs().max()
     if float(spread) <= ONE_PLACE * float(centers.abs().max()):
         raise InputError(
-            f"All {len(capture.views)} cameras of {capture.source} stand at one place, and without different places "
-            "nothing is known of depth. Photograph from several, or estimate the poses anew."
+            f"All {len(capture.views)} cameras of {capture.source} are at the same position, so they contain "
+            "no information about depth. Photograph from several positions, or estimate the poses again."
         )
 
 
@@ -285,7 +285,7 @@ def model_for(scene: Scene) -> tuple[str, str]:
     """Return the model that suits a scene, as model=auto chooses it, and why."""
     if scene.space == "bounded":
         return IN_A_BOX, "the scene stands in a box"
-    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
+    return PHOTOGRAPHS, "the photographs show a background"
 
 
 def grid_for(scene: Scene) -> int:

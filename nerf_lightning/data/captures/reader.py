@@ -287,7 +287,7 @@ class CaptureReader(Reader):
             return {"train": train, "val": held, "test": held}
         if not splits["train"]:
             raise InputError(
-                f"{capture.source} names no view to learn from that is there. Mend its lists, or remove them so that "
+                f"{capture.source} names no view to learn from that is there. Fix its lists, or remove them so that "
                 f"every {self.hold_every}th view is held out."
             )
         held = splits["val"] or splits["test"]

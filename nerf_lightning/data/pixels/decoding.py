@@ -207,7 +207,7 @@ def _mask(
         white = photograph.mask_keeps == "white"
         raise InputError(
             f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is "
-            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Mend the "
+            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Fix the "
             f"mask, leave this view out, or turn all masks round with scene.masks_keep={'black' if white else 'white'}."
         )
     return kept

@@ -199,7 +199,7 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
     for split in SPLITS:
         names = lists.get(split, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"{path}: {split}_filenames must be a list of file names. Mend it, or remove it.")
+            raise InputError(f"{path}: {split}_filenames must be a list of file names. Fix it, or remove it.")
         lost = [name for name in names if _plain(name) not in numbers and _plain(name) not in listed_at_all]
         if lost:
             log.warning("%s: %s_filenames lists %s, which no frame has; this is passed over", path, split, listed(lost))
@@ -254,7 +254,7 @@ def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
         applied[:3] = pose_from_matrix(content["applied_transform"], f"{where}: applied_transform")
         if not is_rigid(applied[:3] / unit_of(applied)):
             raise InputError(
-                f"{where}: applied_transform must turn, move and scale alike along all axes. Mend it, or remove it."
+                f"{where}: applied_transform must turn, move and scale alike along all axes. Fix it, or remove it."
             )
     applied[:3] *= positive_of(content, "applied_scale", where, 1.0)
     return torch.linalg.inv(applied)

@@ -173,7 +173,7 @@ def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slic
                 raise
         forget_workspaces()
         model.most_rays = at_once = at_once // 2
-        log.warning("no memory to render so many rays at once: from now on %d", at_once)
+        log.warning("out of memory: rendering %d rays at a time from now on", at_once)
 
 
 def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture]) -> Picture:

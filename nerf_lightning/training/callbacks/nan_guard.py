@@ -78,7 +78,7 @@ class NanGuard(Callback):
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
         good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.step.progress
         if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
-            raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
+            raise InputError(f"{cause}, so the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
         place = f"checkpoint {good}" if good is not None else "beginning, with new weights, as no checkpoint was saved"
         rate = system.optimizers().param_groups[0]["base_lr"]

@@ -116,7 +116,7 @@ TRANSFORMS = {
     "an absent mask": (frame(1, mask_path="a.png"), r"of 1 files \(mask_path\) 1 are not there: a.png"),
     "a mask of another size": (mask((4, 4)), r"The mask \S+m.png has 4 x 4 pixels, but its photograph \S+p_1.png has"),
     "a split of absent views": (top(train_filenames=["a\nb"]), r"names no view to learn from that is there"),
-    "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Mend it"),
+    "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Fix it"),
     "nothing held out": (top(train_filenames=TWO), r"names no view to judge by that is there: every 8th"),
     "a shear": (top(applied_transform=SHEARED), r"applied_transform must turn, move and scale alike along all axes"),
     "words": (top(applied_transform="none"), r"applied_transform is not a 4 x 4 matrix of numbers"),
@@ -183,7 +183,10 @@ LLFF = {
         lambda root: (root / "images").rename(root / "pictures"),
         r"has no photographs in images, .* the folder itself",
     ),
-    "one place": (cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]), r"All 9 cameras of \S+poses_bounds.npy stand at one place"),
+    "one place": (
+        cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]),
+        r"All 9 cameras of \S+poses_bounds.npy are at the same position",
+    ),
     "one view": (first_alone, r"Holding out views from 1 leaves 0 to learn from and 1 to judge by"),
 }
 
