@@ -44,7 +44,7 @@ class CamerasExport(Export):
 
     Args:
         images: folder of the photographs, relative to the JSON file, prefixed to each name; None: the recorded names.
-        format: `transforms` writes `transforms`.json (`nerfstudio`) and `sparse/0` (COLMAP, text) of the images as
+        format: `transforms` writes `transforms.json` (nerfstudio) and `sparse/0` (COLMAP, text) of the images as
             trained on; `nerfstudio` writes `camera_path.json`, an animation through the photographs for `ns-render
             camera-path`; `blender` writes `cameras_blender.py`, which creates the same animation in Blender.
         fps: photographs per second of such an animation.

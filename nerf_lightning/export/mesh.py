@@ -52,9 +52,9 @@ class MeshExport(Export):
 
     Args:
         resolution: cells along the longest side of the box.
-        surface: `density` extracts the surface where the `density` crosses the threshold; `tsdf` fuses the rendered
+        surface: `density` extracts the surface where the density crosses the threshold; `tsdf` fuses the rendered
             depth of the training views, which is closer to the true surface, and open where no view looks.
-        threshold: with `density`: the `density` at the surface, per scene unit; None: where rendering sees it
+        threshold: with `density`: the density at the surface, per scene unit; None: where rendering sees it
             (`surface_level`).
         truncation: with `tsdf`: the distance in front of and behind a surface within which views are averaged, in
             cells. More is smoother, less keeps thin parts.

@@ -39,7 +39,7 @@ class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
     Args:
-        quality: about 3, 10 or 30 MB.
+        quality: small, medium or large: about 3, 10 or 30 MB.
         resolution: voxels along the longest side of the content; in unbounded scenes, three quarters of them lie along
             the side of the box, and as many around it. None: as the quality.
         photographs: maximum number of photographs to jump to, spread over all; 0: none.

@@ -97,7 +97,7 @@ class MLflow(RunLogger):
 
     Args:
         experiment: the experiment of the run; it is created if it is missing.
-        tracking_uri: the server, or a database such as sqlite:///`mlflow.db`; None: the environment variable
+        tracking_uri: the server, or a database such as `sqlite:///mlflow.db`; None: the environment variable
             MLFLOW_TRACKING_URI, otherwise `mlflow.db` in the run folder.
 
     Raises:

@@ -45,8 +45,9 @@ class SplatsExport(Export):
         num_splats: maximum number of splats; auto: 200 per pixel of a view's side, at most 150,000.
         seconds: seconds of fitting to the training photographs, or to renders of the field without them or if the model
             has a correction per photograph; 0: splats on the field's surfaces.
-        sh_degree: degree of the spherical harmonics of colors, 0 to 3.
-        format: the file format. SPZ needs `pip install 'nerf-lightning[splats]'`.
+        sh_degree: degree of the spherical harmonics of colors, 0 (no view dependence) to 3.
+        format: ply, spz (a sixth of the bytes; needs `pip install 'nerf-lightning[splats]'`) or glb (glTF with
+            KHR_gaussian_splatting).
         longest: maximum length of the longer side of the photographs used for fitting, in pixels.
         max_views: maximum number of held-out views for comparing splats and field.
         seed: the seed of the initial splats and of the order of views.
