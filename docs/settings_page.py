@@ -9,8 +9,8 @@ from nerf_lightning.config.manual.pages import brief
 
 HEAD = """# Settings
 
-Generated from docstrings and YAML files; `nerf help NAME` prints the same for one setting, group or option. A setting is
-given as `name=value`, an option of a group as `group=option`.
+Generated from docstrings and YAML files; `nerf help NAME` prints the same for one setting, group or option. A setting
+is given as `name=value`, an option of a group as `group=option`.
 """
 
 
