@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
-COLOR = "colour"
+COLOR = "color"
 PAPER, LINE = 237, 255
 # Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
