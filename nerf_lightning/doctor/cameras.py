@@ -56,13 +56,13 @@ def common_middle(evidence: Given) -> Check:
         return ok(f"{100 * ahead:.0f} % of the cameras face their common focus point")
     if ahead <= 0.2:
         cure = (
-            "If the photographs show one thing from around, negate the second and third column of every rotation; if "
-            "they were taken outwards from one place, all is well."
+            "If the photographs surround one object, negate the second and third column of every rotation; if they "
+            "look outward from one position, the poses are right."
         )
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
-    cure = "Look at doctor.png: do the cameras face what was photographed? If not, see the check of axes."
-    return look(f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
+    cure = "See doctor.png: the cameras should face what was photographed. If not, see the check of axes."
+    return look(f"only {100 * ahead:.0f} % of the cameras face a common focus point", cure)
 
 
 def upright(evidence: Given) -> Check:

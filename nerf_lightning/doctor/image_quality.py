@@ -75,7 +75,7 @@ def blur(evidence: Evidence) -> Check:
     if hidden := fineness.isnan().any(dim=1).nonzero()[:, 0].tolist():
         least += f" ({evidence.named(hidden)} show too little texture to tell)"
     if not bad:
-        return ok(f"the softest of {len(shown)} photographs has {least}")
+        return ok(f"the least sharp of {len(shown)} photographs has {least}")
     message = f"{len(bad)} of {len(shown)} are blurred: {evidence.named(bad)}; the worst has {least}"
     return look(message, "Remove them (scene.frames, or from the file), or photograph again.")
 
