@@ -37,7 +37,7 @@ def require_sound(scene: Scene) -> list[Check]:
         raise InputError(
             f"The capture {scene.name} cannot be trained on. {first.name}: {first.message}. {first.cure}"
             f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all findings, with a figure; "
-            "doctor=off trains all the same."
+            "doctor=off trains anyway."
         )
     unknown = [check.name for check in checks if check.verdict == "not judged"]
     left = f"; not judged: {', '.join(unknown)}" if unknown else ""

@@ -37,7 +37,7 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     config, choices = chosen_for(scene, "seed=3")
     assert choices["model"] == model
     assert (config.data.batch_rays, config.seed) == (batch_rays, 3)
-    assert f"model: {model}, since " in caplog.text
+    assert f"model: {model}, because " in caplog.text
     assert "(choose another with model=NAME)" in caplog.text
 
 

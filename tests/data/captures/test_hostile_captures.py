@@ -221,7 +221,7 @@ def test_a_json_of_brackets_is_refused_before_they_fill_the_memory(tmp_path, uni
     ("name", "record", "count", "said"),
     [
         ("points3D", 51, 3 * 10**7, "30,000,000 points, more than the limit of 10,000,000"),
-        ("cameras", 48, 10**7, "10,000,000 views, more than the limit of 200,000 .* add budgets.views=10000000"),
+        ("cameras", 48, 10**7, "10,000,000 views, more than the limit of 200,000.* add budgets.views=10000000"),
         ("images", 73, 10**7, "10,000,000 views, more than the limit of 200,000"),
     ],
 )
