@@ -21,7 +21,7 @@ from nerf_lightning.video.shots import Subject
 
 
 def run(config: DictConfig) -> None:
-    """Render color and depth."""
+    """Render colour and depth."""
     on_all_processes("render", config, render)
 
 

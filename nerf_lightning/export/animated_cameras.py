@@ -19,7 +19,7 @@ CAMERA_TYPES: dict[LensModel, str] = {
     "fisheye": "fisheye",
     "equirectangular": "equirectangular",
 }
-SENSOR_WIDTH = 36.0  # Of Blender's camera, in millimeters; its focal length is in these too.
+SENSOR_WIDTH = 36.0  # Of Blender's camera, in millimetres; its focal length is in these too.
 
 
 def nerfstudio_path(cameras: Cameras, fps: int) -> dict[str, Any]:
@@ -47,8 +47,8 @@ def nerfstudio_path(cameras: Cameras, fps: int) -> dict[str, Any]:
 SCRIPT = """# In Blender: Scripting, Open, Run Script. Makes a camera with a keyframe for each photograph.
 import bpy
 
-WIDTH, HEIGHT, FPS, SENSOR_WIDTH = {width}, {height}, {fps}, {sensor}  # pixels, pixels, frames per second, millimeters
-# For each photograph: name, place, rotation (w, x, y, z), focal length in millimeters, shift in widths of the picture.
+WIDTH, HEIGHT, FPS, SENSOR_WIDTH = {width}, {height}, {fps}, {sensor}  # pixels, pixels, frames per second, millimetres
+# For each photograph: name, place, rotation (w, x, y, z), focal length in millimetres, shift in widths of the picture.
 FRAMES = [
 {frames}
 ]

@@ -22,7 +22,7 @@ from nerf_lightning.nerf.models.render_image import picture_surface, render_pict
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 # Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals; and
-# where rays go through normalized device coordinates.
+# where rays go through normalised device coordinates.
 STRAIGHT, BENT = 250, 370
 
 
@@ -105,7 +105,7 @@ def seen_faces(
     tile_points: int,
     report: Report,
 ) -> Int[ndarray, "seen 3"]:
-    """Return the faces that a training view sees, or whose neighbors it does, of which there must be some."""
+    """Return the faces that a training view sees, or whose neighbours it does, of which there must be some."""
     cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
     points = torch.from_numpy(vertices).float()
     seen = torch.zeros(len(points), dtype=torch.bool)

@@ -93,7 +93,7 @@ def checks(runs: CommandLine, device: torch.device, matmul_precision: MatmulPrec
             lambda: _psnr_apart(runs.finished(), device, matmul_precision),
         ),
         Check(
-            "film: two frames against the same pictures rendered here, levels of 255", 1.0, "colors are rounded",
+            "film: two frames against the same pictures rendered here, levels of 255", 1.0, "colours are rounded",
             lambda: _frames_apart(runs.finished(), device, matmul_precision),
         ),
         Check(

@@ -23,7 +23,7 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, frame_of
 from nerf_lightning.video.settings import FilmSettings
 
-# The range of the depth's colors is taken from so many frames, with at most so many pixels along their longer side.
+# The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 8, 64
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Subject:
-    """A model to be filmed, and where it was learned."""
+    """A model to be filmed, and where it was learnt."""
 
     model: Model
     scene: SceneRecord
@@ -46,7 +46,7 @@ class Shot:
     subject: Subject
     cameras: Cameras
     seen_from: Cameras | None
-    """Cameras whose directions the color is looked up from, where the camera itself is held."""
+    """Cameras whose directions the colour is looked up from, where the camera itself is held."""
     near: Float[Tensor, "frames"]
     far: Float[Tensor, "frames"]
     clip: Clip | None
@@ -54,7 +54,7 @@ class Shot:
 
     @property
     def unit(self) -> float:
-        """How many meters, or where nobody knows units of the user's, make a unit of the scene's."""
+        """How many metres, or where nobody knows units of the user's, make a unit of the scene's."""
         return told_length(self.subject.scene)[0]
 
     @property
@@ -75,7 +75,7 @@ class Shot:
         return normals @ (to_user[:3, :3] / unit_of(to_user)).mT.to(normals)
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
-        """Return how far what the picture shows lies from the camera, in meters or the user's units (`unit`).
+        """Return how far what the picture shows lies from the camera, in metres or the user's units (`unit`).
 
         Along the camera's axis; of a panorama, which has none, along the ray.
         """
@@ -152,7 +152,7 @@ def depth_range(shots: list[Shot]) -> tuple[float, float]:
 
 
 def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which cameras normalized device coordinates can render: before the plane z = -1, and looking along -z."""
+    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
     zeros = torch.zeros(len(cameras.c2w))
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
@@ -162,7 +162,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
     """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
     if scene.cameras.ndc is not None:
         raise InputError(
-            f"projection=equirectangular looks to all sides, and {scene.name} was learned in normalized device "
+            f"projection=equirectangular looks to all sides, and {scene.name} was learnt in normalised device "
             "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted."
         )
     if path.fov is not None:
@@ -184,7 +184,7 @@ def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Ca
 
 
 def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
-    """Return the cameras with rays through normalized device coordinates, where the scene was learned in these."""
+    """Return the cameras with rays through normalised device coordinates, where the scene was learnt in these."""
     if scene.cameras.ndc is None:
         return cameras
     count = len(cameras.c2w)

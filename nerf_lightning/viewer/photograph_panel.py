@@ -29,7 +29,7 @@ div:has(> img.{MARK}) {{ width: 100%; height: auto; }}
 img.{MARK} {{ display: block; width: 100%; height: 56px; object-fit: cover; background: #dee2e6; border-radius: 3px; }}
 img.{MARK}:hover {{ outline: 2px solid #228be6; outline-offset: -2px; }}
 </style>"""
-# One gray pixel, in place of a photograph that is not at hand.
+# One grey pixel, in place of a photograph that is not at hand.
 NO_PICTURE = "data:image/gif;base64,R0lGODlhAQABAIAAAN7i5gAAACwAAAAAAQABAAACAkQBADs="
 
 

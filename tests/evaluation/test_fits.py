@@ -1,4 +1,4 @@
-"""Colors and cameras that are fitted to a photograph before they are compared."""
+"""Colours and cameras that are fitted to a photograph before they are compared."""
 
 from dataclasses import replace
 from pathlib import Path

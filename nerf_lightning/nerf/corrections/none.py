@@ -10,7 +10,7 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class NoCorrection(Correction):
-    """Leave every color as it is."""
+    """Leave every colour as it is."""
 
     def fit_to(self, scene: Scene) -> None:
         """Take any scene."""
@@ -20,5 +20,5 @@ class NoCorrection(Correction):
         return rendering
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
-        """Return the colors themselves."""
+        """Return the colours themselves."""
         return rgb

@@ -1,4 +1,4 @@
-"""Learned features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
+"""Learnt features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
 
 import math
 

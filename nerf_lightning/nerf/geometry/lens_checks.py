@@ -1,4 +1,4 @@
-"""Which lenses can be inverted over their whole image; the others are refused before anything is learned."""
+"""Which lenses can be inverted over their whole image; the others are refused before anything is learnt."""
 
 from collections.abc import Sequence
 

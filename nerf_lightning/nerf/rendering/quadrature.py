@@ -48,10 +48,10 @@ def composite(
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
-        output: density and color at the samples' midpoints.
+        output: density and colour at the samples' midpoints.
         samples: the intervals.
         rays: where near and far stand.
-        background: color behind each ray; None closes the ray instead.
+        background: colour behind each ray; None closes the ray instead.
     """
     weights = weights_from_density(output.density, samples.deltas)
     if background is None:

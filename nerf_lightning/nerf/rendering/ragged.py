@@ -18,10 +18,10 @@ def composite_ragged(
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
-        output: density and color at the samples' midpoints.
+        output: density and colour at the samples' midpoints.
         samples: the intervals.
         rays: where far stands.
-        background: color behind each ray; None leaves the rays open in front of black.
+        background: colour behind each ray; None leaves the rays open in front of black.
     """
     foreground, opacity, depth, weights = integrate(output.density, output.rgb, samples)
     escaped = 1.0 - opacity

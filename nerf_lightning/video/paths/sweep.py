@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
 CROSSED_BY_A_CIRCLE, CROSSED_BY_AN_ARC = 75.0, 40.0
-"""Degrees between neighboring photographs, seen from above, over which a path may lead."""
+"""Degrees between neighbouring photographs, seen from above, over which a path may lead."""
 OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
 NEAREST = 0.1  # Quantile of the photographs' distances; nearer, content leaves the picture.
 HIGHEST = 80.0  # Degrees; straight above the content a picture has no up.
@@ -56,7 +56,7 @@ class Sweep(CameraPath):
         distance = (weights @ distances.log()).exp().clamp(min=float(torch.quantile(distances, NEAREST)))
         level = azimuth.deg2rad().cos()[:, None] * east + azimuth.deg2rad().sin()[:, None] * north
         eyes = around.center + distance[:, None] * (height.cos() * level + height.sin() * up)
-        # Aimed as those nearby, of whose axes this is the point nearest to the center.
+        # Aimed as those nearby, of whose axes this is the point nearest to the centre.
         axes = -around.poses[:, :, 2]
         aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
         return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)

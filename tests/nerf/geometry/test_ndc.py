@@ -1,4 +1,4 @@
-"""Normalized device coordinates: closed forms, straight lines, and the way back."""
+"""Normalised device coordinates: closed forms, straight lines, and the way back."""
 
 from dataclasses import replace
 
