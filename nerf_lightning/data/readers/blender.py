@@ -51,6 +51,8 @@ class BlenderReader(GivenFrameReader):
             untrusted.
     """
 
+    named_by = (".json",)
+
     root: str
     skip: Mapping[str, int] | None = None
     metres_per_unit: float | None = None

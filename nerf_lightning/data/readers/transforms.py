@@ -47,6 +47,8 @@ class TransformsReader(CaptureReader):
         depth_unit: length of one level of the 16-bit depth maps (`depth_file_path`), in the capture's units.
     """
 
+    named_by = (".json",)
+
     name: str = "transforms"
     file: str | None = None
     depth_unit: float = 1e-3

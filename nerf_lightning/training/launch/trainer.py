@@ -38,8 +38,8 @@ class TrainerSettings(ComputeSettings):
         val_every_steps: steps between validations.
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
-        cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; for models
-            with an occupancy grid. Not yet run on a GPU.
+        cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
+            for refinement, correction and losses that learn. Not yet run on a GPU.
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
