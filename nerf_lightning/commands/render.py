@@ -21,7 +21,7 @@ from nerf_lightning.video.shots import Subject
 
 
 def run(config: DictConfig) -> None:
-    """Render colour and depth."""
+    """Render color and depth."""
     on_all_processes("render", config, render)
 
 

@@ -171,12 +171,12 @@ def _check_background(scene: Scene) -> None:
     if scene.background == "none" and scene.pixels.has_transparency:
         raise InputError(
             f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
-            "scene.background=none would train on colours without their alpha. Use white, black or random."
+            "scene.background=none would train on colors without their alpha. Use white, black or random."
         )
     if scene.background in DRAWN and not scene.pixels.has_transparency:
         log.warning(
             "scene.background=%s: the pictures of %s have no transparent pixels, so whatever lies behind the "
-            "scene is part of them and is learnt as matter. Give the background's colour instead "
+            "scene is part of them and is learned as matter. Give the background's color instead "
             "(scene.background=black or white).",
             scene.background,
             scene.name,

@@ -71,7 +71,7 @@ def warn_of_faults(scene: Scene) -> None:
 
 
 def _nothing(pixels: PixelStore, view: int) -> str | None:
-    """Return what is there in the place of a picture: one colour, or nothing at all; None: a picture."""
+    """Return what is there in the place of a picture: one color, or nothing at all; None: a picture."""
     rgba, kept = pixels.view(view), pixels.kept(view)
     for step in (max(1, len(rgba) // ROWS), 1):
         part = rgba[::step].reshape(-1, 4) if kept is None else rgba[::step][kept[::step]]

@@ -24,7 +24,7 @@ RESOLUTIONS: dict[Space, dict[Quality, int]] = {
     "ndc": {"small": 128, "medium": 216, "large": 320},
     "contracted": {"small": 108, "medium": 128, "large": 192},
 }
-# and spherical harmonics of its colours: without bounds much is fog, which hides less what changes with the direction.
+# and spherical harmonics of its colors: without bounds much is fog, which hides less what changes with the direction.
 HARMONICS: dict[Space, dict[Quality, int]] = {
     "bounded": {"small": 4, "medium": 4, "large": 9},
     "ndc": {"small": 4, "medium": 4, "large": 9},

@@ -103,7 +103,7 @@ def assemble(
         config: of the run.
         choices: the names picked from each group, which its checkpoints keep.
         settings: of the machine.
-        scene: what is learnt.
+        scene: what is learned.
         model: one in the place of the config's.
         loss: the same.
     """

@@ -82,7 +82,7 @@ class TrainStep:
     Args:
         model: what learns.
         rays: makes the rays through a batch's pixels.
-        loss: one number per level; their sum is minimised.
+        loss: one number per level; their sum is minimized.
         optimizer: takes the parameters.
         schedule: factor on the learning rate as a function of the attempt's step.
         progress: the run's place; it is changed here, and read by the loader.
@@ -93,7 +93,7 @@ class TrainStep:
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
-        correction: what photographs make of the rendered colours; None leaves them alone.
+        correction: what photographs make of the rendered colors; None leaves them alone.
         jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
             evaluation, so that steps differ in their pixels alone.
 
@@ -289,7 +289,7 @@ class TrainStep:
         """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
 
         Args:
-            batch: pixels, colours, weights.
+            batch: pixels, colors, weights.
             backward: adds a loss's gradients to the parameters'.
             share: what part of the step's batch this is; None: all of it.
 

@@ -1,7 +1,7 @@
 """The frames of a film on the disk: each is written as soon as it is rendered, so a stopped film goes on.
 
 `.frames/film.json` in the output folder says which film the frames belong to (a fingerprint of all that decides what is
-seen) and over which depths their colours reach.
+seen) and over which depths their colors reach.
 """
 
 import logging
@@ -53,7 +53,7 @@ class FilmFrames:
         self.suffix = ".exr" if form == "exr" else ".png"
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
-        """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
+        """Take hold of the folder; return the frames that are missing, and the range of the depth's colors.
 
         Frames of another film are removed, and the range is measured anew. A folder that another process films into, or
         whose files are not ours, is refused.

@@ -26,7 +26,7 @@ def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
     """Return a channel of a view as a picture.
 
     Depth is bright where it is near, over the range of what this view shows; normals are in the model's axes, each from
-    -1 to 1 as red, green and blue. What light passes through fades to pale grey.
+    -1 to 1 as red, green and blue. What light passes through fades to pale gray.
     """
     return to_bytes(CHANNELS[channel](view))
 

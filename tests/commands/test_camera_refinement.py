@@ -60,6 +60,6 @@ def test_a_scene_whose_rays_are_bent_is_refused_with_the_reason(nerf, tmp_path):
                   f"paths.output_dir={tmp_path / 'run'}")  # fmt: skip
     assert result.code == 2
     assert "Traceback" not in result.err
-    for part in ("normalised device coordinates", "scene.space=contracted", "refinement=none"):
+    for part in ("normalized device coordinates", "scene.space=contracted", "refinement=none"):
         assert part in result.err.splitlines()[-1]
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""A run goes on with the capture that it has learnt from, wherever it is started: another one is refused."""
+"""A run goes on with the capture that it has learned from, wherever it is started: another one is refused."""
 
 import json
 import shutil

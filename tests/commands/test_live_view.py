@@ -1,4 +1,4 @@
-"""The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
+"""The page while training: it shows what is learned, changes nothing of it, and closes with the run."""
 
 import math
 import re

@@ -93,7 +93,7 @@ def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path,
     assert_same_to_the_bit(state(folder), never_stopped)
 
 
-# What srun sets for a job of one task; by SLURM_NTASKS Lightning recognises Slurm.
+# What srun sets for a job of one task; by SLURM_NTASKS Lightning recognizes Slurm.
 SLURM = {"JOB_ID": "4711", "JOB_NAME": "nerf", "NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0"}
 SLURM |= {"NODELIST": "localhost"}
 

@@ -104,7 +104,7 @@ def _page(asked: bool | str) -> PageExport | None:
 
 
 def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:
-    """Return the scene with the cameras that the run has learnt, and what a person reads about them."""
+    """Return the scene with the cameras that the run has learned, and what a person reads about them."""
     system: Any = trainer.lightning_module
     trained = scene.splits["train"]
     learnt = system.rays.refined(trained)

@@ -1,4 +1,4 @@
-"""How much of space is modelled, the working frame of a capture, and where along its rays content may lie."""
+"""How much of space is modeled, the working frame of a capture, and where along its rays content may lie."""
 
 import math
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ ONE_PLACE = 1e-9
 # Of the cube that the ball of the cameras just holds.
 UNIT_BALL_HALF = 3**-0.5
 # The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
-# normalised device coordinates.
+# normalized device coordinates.
 LEAST_AHEAD = 0.1
 CONTRACTED_SIDE = 4.0
 """Of the cube that holds contracted space."""
@@ -208,7 +208,7 @@ def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "
         return torch.stack([corners.amin(dim=0), corners.amax(dim=0)]).float()
     if len(capture.points) >= FEWEST_POINTS:
         points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
-        # Alike towards all sides, so that it does not depend on where the user's x axis points.
+        # Alike toward all sides, so that it does not depend on where the user's x axis points.
         level = (1.0 + BOX_MARGIN) * torch.quantile(points[:, :2].norm(dim=-1), QUANTILES[1])
         low, high = torch.quantile(points[:, 2], points.new_tensor(QUANTILES))
         room = BOX_MARGIN * (high - low)
@@ -292,7 +292,7 @@ def grid_for(scene: Scene) -> int:
     """Return the finest resolution of a hash grid whose cells are as small as the pixels.
 
     Half of the pixels are at least as wide, where they see the scene, as a cell: of the cube from -2 to 2 that all of
-    space is contracted to, or of normalised device coordinates, in which a picture has width 2. They see it where
+    space is contracted to, or of normalized device coordinates, in which a picture has width 2. They see it where
     sparse points or depths say; where there are none, as far away as the middle of the scene.
     """
     cameras, train = scene.cameras, torch.tensor(scene.splits["train"])

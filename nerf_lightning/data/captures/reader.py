@@ -104,7 +104,7 @@ class CaptureReader(Reader):
         """
 
     def read(self) -> Scene:
-        """Return the capture as a scene in a working frame: upright, centred, of a handy size.
+        """Return the capture as a scene in a working frame: upright, centered, of a handy size.
 
         Raises:
             InputError: a setting that makes no sense, or anything wrong with the files.

@@ -169,7 +169,7 @@ def _file_of(root: Path, split: str) -> Path | None:
 def _is_photographed(path: Path) -> bool:
     """Tell whether a file lists photographs, as instant-ngp's do, and not renderings of the original format.
 
-    Photographs have a lens, or opaque pictures without one colour at all four corners.
+    Photographs have a lens, or opaque pictures without one color at all four corners.
     """
     file = FrameFile.read(path, FORMAT)
     first = file.frames[0] if file.frames and isinstance(file.frames[0], dict) else {}

@@ -267,7 +267,7 @@ def read_model(folder: Path) -> ColmapModel:
     with reading(images_path, CURE):
         images = sorted(files.images(images_path), key=lambda image: image.name)
     if not images:
-        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
+        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learned. {CURE}")
     with reading(points_path, CURE):
         points = files.points(points_path) if points_path.exists() else NO_POINTS
     if points is NO_POINTS and (folder / PLY).is_file():

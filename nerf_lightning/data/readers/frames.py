@@ -73,7 +73,7 @@ class FrameFile:
 
 
 def say_of_files(files: Sequence[FrameFile]) -> None:
-    """Say what of the files of one capture is not used, or not modelled."""
+    """Say what of the files of one capture is not used, or not modeled."""
     first, read = files[0].path, {file.path for file in files}
     beside = sorted(path.name for path in first.parent.glob("transform*_*.json") if path not in read)
     if beside:

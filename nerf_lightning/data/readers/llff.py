@@ -123,7 +123,7 @@ def _registered(root: Path, names: list[str]) -> list[str]:
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
-    """Return a row for each view: a 3 x 5 matrix (down, right, back, centre; height, width, focal) and two depths."""
+    """Return a row for each view: a 3 x 5 matrix (down, right, back, center; height, width, focal) and two depths."""
     if not path.is_file():
         raise InputError(
             f"{path} does not exist; the folder holds {contents(path.parent)}. "

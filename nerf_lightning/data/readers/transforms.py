@@ -178,7 +178,7 @@ def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, 
 
 
 def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[int, ...]] | None:
-    """Return the splits of files called after them; others are learnt from."""
+    """Return the splits of files called after them; others are learned from."""
     splits: dict[str, tuple[int, ...]] = {split: () for split in SPLITS}
     start = 0
     for path, count in zip(paths, counts, strict=True):
@@ -254,7 +254,7 @@ def _undo_of(files: list[FrameFile]) -> Float[Tensor, "4 4"]:
 def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
     """Invert nerfstudio's `applied_transform` and `applied_scale`: results line up with what the poses came from.
 
-    In the file's poses the transform was applied to the camera, and then the scale to its centre.
+    In the file's poses the transform was applied to the camera, and then the scale to its center.
     """
     applied = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in content:

@@ -27,7 +27,7 @@ class SfmSettings:
     """How structure from motion is done.
 
     Args:
-        matching: which photographs are compared: all pairs, neighbours in the order of names, or by their number.
+        matching: which photographs are compared: all pairs, neighbors in the order of names, or by their number.
         camera_mode: one camera for all, one each, or one per size and EXIF focal length.
         camera_model: COLMAP's name of the lens model; panoramas have one of their own.
         panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice

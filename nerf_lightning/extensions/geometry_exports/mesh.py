@@ -1,4 +1,4 @@
-"""A mesh of the surface: of the density or of what the views see, cleaned, coloured, in the user's frame."""
+"""A mesh of the surface: of the density or of what the views see, cleaned, colored, in the user's frame."""
 
 import logging
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MeshExport(Export):
-    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a colour per vertex or a texture.
+    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a color per vertex or a texture.
 
     Args:
         resolution: cells along the longest side of the box.

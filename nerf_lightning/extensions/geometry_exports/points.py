@@ -1,4 +1,4 @@
-"""A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
+"""A colored point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
 
 import logging
 import math
@@ -176,11 +176,11 @@ def save_points(
 
 MOST_STEPS = 1e9  # LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
 FINEST = 1e-30  # What a cloud of one place at zero gets.
-COLOR_SCALE = 257  # Colours have 16 bits there, full scale: 255 becomes 65535.
+COLOR_SCALE = 257  # Colors have 16 bits there, full scale: 255 becomes 65535.
 
 
 def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarray, "points 3"]) -> None:
-    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colours, no normals), whole or not at all."""
+    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colors, no normals), whole or not at all."""
     laspy = require_library("laspy", "las")
     header = laspy.LasHeader(version="1.2", point_format=2)
     header.generating_software = "nerf-lightning"

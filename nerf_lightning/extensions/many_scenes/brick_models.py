@@ -1,6 +1,6 @@
 """Models of bricks beside the fire engine: random vehicles and towers, each a function of its number alone.
 
-They differ in what they are, in shape, in colours, in how they are turned and in where the light comes from.
+They differ in what they are, in shape, in colors, in how they are turned and in where the light comes from.
 """
 
 from collections.abc import Sequence

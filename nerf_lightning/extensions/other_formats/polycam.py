@@ -20,7 +20,7 @@ FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 @dataclass
 class PolycamReader(CaptureReader):
-    """Read the raw data that Polycam exports in its developer mode. Units are metres; y is up.
+    """Read the raw data that Polycam exports in its developer mode. Units are meters; y is up.
 
     Args:
         depth_unit: length of one level of the 16-bit depth maps, in meters.

@@ -154,7 +154,7 @@ class SplatsExport(Export):
 
 
 def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras) -> list[View]:
-    """Return the photographs that the model learnt from, by its record, and of which anything counts."""
+    """Return the photographs that the model learned from, by its record, and of which anything counts."""
     trained = {record.view_names[view] for view in record.splits["train"]}
     known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
     views = [photographed(scene, view, pinholes) for view in known]
@@ -168,7 +168,7 @@ def extent(cameras: Cameras) -> float:
 
 
 def to_gltf(record: SceneRecord) -> Float[Tensor, "4 4"]:
-    """Return what takes the capture's frame to glTF's, where y is up and a unit is a metre, as far as that is known."""
+    """Return what takes the capture's frame to glTF's, where y is up and a unit is a meter, as far as that is known."""
     up = directions_to_user(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), record.to_user.double())
     matrix = y_up(up)
     matrix[:3] *= record.metres_per_unit or 1.0

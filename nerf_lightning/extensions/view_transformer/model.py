@@ -54,9 +54,9 @@ log = logging.getLogger(__name__)
 
 
 class ViewTransformer(Model):
-    """Photographs' features at the projections of a ray's points; attention over views, then along the ray; colour.
+    """Photographs' features at the projections of a ray's points; attention over views, then along the ray; color.
 
-    There is no density and no compositing: the colour is read off the points' states, over the background of the
+    There is no density and no compositing: the color is read off the points' states, over the background of the
     photographs. Opacity is 1, and 0 where no source sees the ray. Depth is the mean distance under the attention of the
     last block. Dropout is left out, so that a run has the same bits again.
 

@@ -45,7 +45,7 @@ class Exposure(Correction):
         self.trained = torch.tensor(scene.splits["train"])
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
-        """Return the colours with their light scaled by the gains of their photographs."""
+        """Return the colors with their light scaled by the gains of their photographs."""
         return scale_light(rgb, self.gains()[pixels.view])
 
     def gains(self) -> Float[Tensor, "views 3"]:

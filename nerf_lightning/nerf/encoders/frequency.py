@@ -46,4 +46,4 @@ class FrequencyEncoder(Encoder):
         return torch.cat([points, waves], dim=-1) if self.include_input else waves
 
     def reset_parameters(self) -> None:
-        """Nothing is learnt here."""
+        """Nothing is learned here."""

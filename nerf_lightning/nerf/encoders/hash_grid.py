@@ -1,4 +1,4 @@
-"""Learnt features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
+"""Learned features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
 
 import math
 

@@ -21,7 +21,7 @@ MOST_LAYERS = 100
 
 
 class NerfMLP(Field):
-    """Eight layers of 256 with one skip; density before the direction enters; a 128-wide colour head.
+    """Eight layers of 256 with one skip; density before the direction enters; a 128-wide color head.
 
     Args:
         position_encoder: features of positions, gamma(x).
@@ -96,11 +96,11 @@ class NerfMLP(Field):
         require_box(self.aabb)
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], None]:
-        """Return the density per unit length, without paying for colour."""
+        """Return the density per unit length, without paying for color."""
         return self._activate(_exactly(self.density_head, self._trunk(points.positions))[..., 0], None), None
 
     def forward(self, points: Points, features: Tensor | None = None) -> FieldOutput:
-        """Return density and colour; density does not depend on the direction. There are no features."""
+        """Return density and color; density does not depend on the direction. There are no features."""
         hidden = self._trunk(points.positions)
         raw_density = _exactly(self.density_head, hidden)[..., 0]
         feature = self.color_feature(hidden, points)
@@ -114,11 +114,11 @@ class NerfMLP(Field):
         return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
 
     def color_feature(self, hidden: Float[Tensor, "*points width"], points: Points) -> Float[Tensor, "*points width"]:
-        """Return what the colour is made of besides the direction; a field that follows this one may add to it."""
+        """Return what the color is made of besides the direction; a field that follows this one may add to it."""
         return self.feature(hidden)
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the layers of the trunk, the feature and the colour's; encodings that join them stand behind them."""
+        """Return the layers of the trunk, the feature and the color's; encodings that join them stand behind them."""
         following = ((f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk)))
         readers = (*following, ("density_head.weight", "feature.weight"))
         trunk = [HiddenLayer(self._rows(f"trunk.{number}"), each) for number, each in enumerate(readers)]
@@ -171,7 +171,7 @@ class NerfMLP(Field):
 
 
 def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
-    # With so few outputs float32 costs nothing, and a density or a colour keeps the digits that it has.
+    # With so few outputs float32 costs nothing, and a density or a color keeps the digits that it has.
     return linear(features, head.weight, head.bias, "float32")
 
 

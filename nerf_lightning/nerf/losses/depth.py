@@ -63,7 +63,7 @@ def distance_error(
 ) -> Float[Tensor, "rays"]:
     """Return sum_i w_i min(1, |log(z_i / z)|) of each ray, where z_i / z is the ratio of depths of t_i and `distance`.
 
-    In normalised device coordinates the depth at t is z_near / (1 - t / infinity) (`ndc.world_distance`).
+    In normalized device coordinates the depth at t is z_near / (1 - t / infinity) (`ndc.world_distance`).
     """
     t = rendering.samples.midpoints
     if isinstance(rendering, RaggedRendering):

@@ -51,7 +51,7 @@ class DenseLevel(Level):
             self.gradient_scaling_distance = 0.0
 
     def compile_field(self) -> bool:
-        """Compile the field, for static shapes: dynamic ones may be specialised otherwise after a resume."""
+        """Compile the field, for static shapes: dynamic ones may be specialized otherwise after a resume."""
         if self.field.compiles:
             self.field.compile(dynamic=False)
         return self.field.compiles

@@ -1,4 +1,4 @@
-"""A level that only proposes where to look: density without colour."""
+"""A level that only proposes where to look: density without color."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ class ProposalLevel(DenseLevel):
             return super().forward(rays, background, history, random)
 
     def field_parts(self) -> FieldParts | None:
-        """Return the field's, without colours."""
+        """Return the field's, without colors."""
         parts = self.field.parts()
         return None if parts is None else replace(parts, color_weights=[])
 

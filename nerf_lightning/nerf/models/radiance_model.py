@@ -83,7 +83,7 @@ class RadianceModel(PointField):
         return self.last.density(positions)
 
     def query(self, points: Points) -> FieldOutput:
-        """Return density and colour of points by themselves, as the last level's field has them."""
+        """Return density and color of points by themselves, as the last level's field has them."""
         return self.last.field(points)
 
     def forward(
@@ -96,7 +96,7 @@ class RadianceModel(PointField):
 
         Args:
             rays: unit directions, scene units.
-            background: colour behind each ray; None closes the ray.
+            background: color behind each ray; None closes the ray.
             random: the step's numbers for these rays; None for evaluation.
         """
         history: list[Rendering] = []

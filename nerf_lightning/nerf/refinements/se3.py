@@ -74,12 +74,12 @@ class SE3Delta(Refinement):
         """Take note of the cameras and of the scene's extent, once, before training.
 
         Raises:
-            InputError: rays run through normalised device coordinates, there are too few photographs, or more of
-                panoramas than their poses is to be learnt.
+            InputError: rays run through normalized device coordinates, there are too few photographs, or more of
+                panoramas than their poses is to be learned.
         """
         if scene.cameras.ndc is not None:
             raise InputError(
-                f"refinement: the scene {scene.name} is trained in normalised device coordinates (scene.space=ndc), "
+                f"refinement: the scene {scene.name} is trained in normalized device coordinates (scene.space=ndc), "
                 "which bend all rays as one camera that looks straight ahead sees them, so a camera that turns would "
                 "no longer fit the others. Train with scene.space=contracted, or with refinement=none."
             )
@@ -97,7 +97,7 @@ class SE3Delta(Refinement):
         self.learn(scene.cameras, scene.aabb, photographs)
 
     def learn(self, cameras: Cameras, aabb: Float[Tensor, "2 3"], photographs: int) -> None:
-        """Make room for what is learnt of some cameras; `photographs` of them are trained on, the box holds content."""
+        """Make room for what is learned of cameras; `photographs` of them are trained on, the box holds content."""
         views = len(cameras.width)
         extent = (aabb[1] - aabb[0]).norm() / 2.0
         ahead = -((aabb.mean(dim=0) - cameras.c2w[:, :, 3]) * cameras.c2w[:, :, 2]).sum(dim=1)
@@ -116,7 +116,7 @@ class SE3Delta(Refinement):
 
     @disable_autocast
     def forward(self, cameras: Cameras) -> Cameras:
-        """Return the cameras as they have been learnt so far."""
+        """Return the cameras as they have been learned so far."""
         if self.is_held:
             return cameras
         if self.poses:

@@ -101,7 +101,7 @@ class OccupancySampler(RaggedSampler):
         self.grid.aabb.copy_(scene.aabb)
         self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
-        # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
+        # In normalized device coordinates cells are not where the cameras see them, but all of them are seen.
         if scene.space == "ndc":
             self.grid.possible.fill_(True)
         else:
@@ -123,7 +123,7 @@ class OccupancySampler(RaggedSampler):
         if inside:
             log.warning(
                 "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
-                "learnt. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
+                "learned. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
                 "make the box smaller (scene.aabb_half).",
                 inside,
                 eyes.shape[0],

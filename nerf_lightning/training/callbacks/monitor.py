@@ -85,7 +85,7 @@ def level_scalars(
     Args:
         names: of the levels.
         losses: of each, of whatever kind.
-        errors: the mean squared error of the colours that each shows.
+        errors: the mean squared error of the colors that each shows.
         pictures: the names of the levels that show some, whose PSNR is logged.
     """
     losses, shown = torch.stack([losses, psnr(errors)]).cpu()  # the device is read once

@@ -22,8 +22,8 @@ PARTS = 50
 class RayHistograms(Watcher):
     """Render some of the step's rays again, as training does, and tell for each level what lies along them.
 
-    A coarse level that has learnt nothing spreads its weight evenly. Weight that piles up at 0 or at 1 lies at the near
-    or the far bound, which then cut the scene.
+    A coarse level that has learned nothing spreads its weight evenly. Weight that piles up at 0 or 1 lies at the near
+    or far bound, which then cuts off the scene.
 
     Args:
         every_steps: steps between two histograms.

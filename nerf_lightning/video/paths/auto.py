@@ -11,7 +11,7 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.paths.sweep import Sweep
 
-FACING = 0.7  # Least cosine between where most photographs look and the centre.
+FACING = 0.7  # Least cosine between where most photographs look and the center.
 
 
 @final
@@ -43,7 +43,7 @@ class AutoPath(CameraPath):
 
 @disable_autocast
 def looks_at_center(around: PathFrame) -> bool:
-    """Tell whether most photographs show the centre, seen from different sides; forward-facing captures have none."""
+    """Tell whether most photographs show the center, seen from different sides; forward-facing captures have none."""
     if around.forward_facing:
         return False
     offsets = normalize(around.poses[:, :, 3] - around.center, dim=-1)

@@ -14,7 +14,7 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 @final
 @dataclass
 class Orbit(CameraPath):
-    """Circle around the centre, anticlockwise from above; the last frame precedes the first, not repeats it.
+    """Circle around the center, anticlockwise from above; the last frame precedes the first, not repeats it.
 
     Args:
         elevation: degrees above the horizon, between -90 and 90, both excluded.

@@ -196,7 +196,7 @@ def test_a_jpeg_that_goes_over_its_pixels_without_end(tmp_path, kind):
 
 
 def test_a_jpeg_of_fewer_bits_than_blocks_was_cut_short(tmp_path):
-    """A decoder makes up the rest, and 1000 bytes become hundreds of megapixels of grey."""
+    """A decoder makes up the rest, and 1000 bytes become hundreds of megapixels of gray."""
     stream = io.BytesIO()
     Image.fromarray(np.zeros((12, 16), np.uint8)).save(stream, "JPEG")
     small = stream.getvalue()
