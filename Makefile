@@ -123,5 +123,5 @@ fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_planted_resume.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
-	rm -rf $(VENV) $(XLA_VENV) build dist docs/_build docs/settings.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) $(XLA_VENV) build dist docs/_build docs/settings.md docs/index.md docs/api.md docs/security.md docs/contributing.md docs/changelog.md docs/extension_*.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 	find nerf_lightning tests -name __pycache__ -type d -exec rm -rf {} +

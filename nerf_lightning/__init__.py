@@ -1,14 +1,14 @@
-"""nerf_lightning: learn a radiance field from photographs with known cameras, and render new views.
+"""nerf_lightning: train radiance fields from photographs and render new views.
 
-From Python: `read` a capture, `load` a trained model, `train` one; with Lightning's own Trainer: `build_run`,
-`RadianceFieldSystem` and `RayDataModule`. They are loaded when they are asked for; `__init__.pyi` has their types.
+From Python: `read` a capture, `train` a model, `load` a trained one; with Lightning's own Trainer: `build_run`,
+`RadianceFieldSystem` and `RayDataModule`. They are imported on first use; `__init__.pyi` has their types.
 """
 
 import importlib
 import zlib  # noqa: F401  before pycolmap, which brings another that Pillow's PNGs would be mixed with
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _OFFERED = {
     "Cameras": "nerf_lightning.nerf.types.scene",

@@ -1,4 +1,4 @@
-"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page."""
+"""Export a trained scene as a page, mesh, points, splats, volume, depth maps or cameras."""
 
 import logging
 from dataclasses import asdict
@@ -60,7 +60,7 @@ def export(config: DictConfig) -> None:
             record = scene_record(scene_to_look_at(opened, None))
         written = what.export(opened.model, record, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
-        say("the cameras are those that training refined (refinement=...), not those that were read")
+        say("the cameras are the refined ones (refinement=...), not those that were read")
     say(*map(str, written))
 
 

@@ -1,4 +1,4 @@
-"""Learn a radiance field from photographs with known cameras."""
+"""Train a radiance field from photographs."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -78,7 +78,7 @@ def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> 
             "there is. Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
         )
     log.warning(
-        "torch sees a GPU here, and it cannot be used: %s. The CPU computes instead; trainer=gpu insists on the GPU.",
+        "PyTorch sees a GPU, but it cannot be used: %s. The CPU is used instead; trainer=gpu insists on the GPU.",
         trouble,
     )
     return "cpu", "the GPU cannot be used"

@@ -65,7 +65,7 @@ def resolve_auto(
         seconds = PHOTOS_SECONDS if of_photos else None
     if choices.get("model") == AUTO:
         name, reason = model_for(scene)
-        log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
+        log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
         with_model = [*overrides, f"model={name}"]
         if name == PHOTOGRAPHS:
             with_model += _for_photographs(scene, overrides, seconds)
@@ -101,7 +101,7 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
         suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
     if "loss" not in typed and scene.depths is not None:
         log.info(
-            "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
+            "loss: depth, since the distance of %s pixels is known (loss=proposal ignores it)",
             f"{len(scene.depths):,}",
         )
         suited.append("loss=depth")
@@ -144,7 +144,7 @@ def resolve_correction(
         cause = "the run began with it" if kept else None
     picked["correction"] = "exposure" if cause else "none"
     if cause:
-        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", cause)
+        log.info("correction: exposure, since %s (correction=none leaves colors unchanged)", cause)
         config = copy.deepcopy(config)
         config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked

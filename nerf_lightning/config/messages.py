@@ -165,7 +165,7 @@ def _no_option(group: str, name: str) -> str | None:
     if not options:  # not ours: of a folder that hydra.searchpath names, or of a plugin
         return None
     cure = did_you_mean(name, options, f"{group}=") or f" Its options are {', '.join(options)}."
-    return f"There is no {group}={name}.{cure} nerf help {group} tells of each."
+    return f"There is no {group}={name}.{cure} nerf help {group} lists them."
 
 
 def _no_setting(name: str, value: str | None, asked: Command) -> str:

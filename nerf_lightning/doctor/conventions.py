@@ -93,7 +93,7 @@ AXES = (
         _poses(lambda c2w: inverted(axes(c2w, FLIP_YZ))),
     ),
     Reading(
-        "as if their rotations were transposed", "Transpose every rotation, leave the centres.", _poses(transposed)
+        "as if their rotations were transposed", "Transpose every rotation, leave the centers.", _poses(transposed)
     ),
     Reading(
         "as if their rotations were transposed, with OpenCV's axes",

@@ -27,34 +27,34 @@ from nerf_lightning.video.shots import Subject, content_of, lay_path, shot_of
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A model with its weights, on its device, in evaluation mode, and what it knows of its capture."""
+    """A trained model on its device, in evaluation mode, with the cameras of its capture."""
 
     module: Model = field(repr=False)
-    """The network: a torch module that takes rays."""
+    """The network: a PyTorch module that renders rays."""
     checkpoint: Checkpoint = field(repr=False)
-    """The file as read: config, choices, step, precision."""
+    """The checkpoint: config, chosen options, step, precision."""
     tile_points: int
-    """Most points that go through a field at once."""
+    """Maximum number of points that go through a field at once."""
 
     @property
     def scene(self) -> SceneRecord:
-        """Cameras (those that training has refined, where it did), bounds, splits and names; no photographs."""
+        """Cameras (refined ones, if training refined them), bounds, splits and names, without photographs."""
         return self.checkpoint.scene
 
     def render(self, camera: Cameras | int | str, background: str | None = None) -> Picture:
-        """Render what a camera sees.
+        """Render the view of a camera.
 
         Args:
             camera: one camera in the frame of `self.scene` (`scene.cameras[3]`, `self.path("orbit")[0]`), or the
-                number or the name of one of its views.
-            background: what lies behind the scene: white, black or none; None: as in training.
+                number or name of a view.
+            background: white, black or none; None: as in training.
 
         Returns:
             On the CPU: `rgb` (height x width x 3, sRGB in [0, 1] up to rounding), `depth` (height x width, the expected
             distance along each pixel's ray in scene units; light that escapes ends at far), `opacity` (height x width).
 
         Raises:
-            InputError: there is no such view or background, or several cameras were given.
+            InputError: unknown view or background, or several cameras.
         """
         with torch.no_grad(), in_words("render"):
             behind = known_background(background or self.scene.background)
@@ -66,15 +66,15 @@ class TrainedModel:
             return render_picture(self.module, rays_of, view, behind, self.tile_points)
 
     def path(self, name: str = "orbit", **settings: Any) -> Cameras:
-        """Return the cameras of a camera path around the capture, in order of time, to be rendered one by one.
+        """Return the cameras of a path around the capture, one per frame.
 
         Args:
-            name: of the path, in `conf/path/`: orbit, spiral, keyframes, ...
-            **settings: of the path, as `nerf help render path=...` lists them, in the capture's own frame and units:
-                `num_frames=40`, `width=320`.
+            name: a path in `conf/path/`: orbit, spiral, keyframes, ...
+            **settings: settings of the path, as `nerf help render path=...` lists them, in the capture's own frame and
+                units: `num_frames=40`, `width=320`.
 
         Raises:
-            InputError: an unknown path or setting, or the path cannot be laid around this capture.
+            InputError: unknown path or setting, or the path does not suit this capture.
         """
         overrides = [f"path={name}", *(f"path.{key}={quoted(value)}" for key, value in settings.items())]
         with in_words("render"):
@@ -83,13 +83,12 @@ class TrainedModel:
             return lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
 
     def of_scene(self, scene: Scene) -> "TrainedModel":
-        """Return the same network for another scene, which it renders from the photographs of that scene from now on.
+        """Return the same network for another scene, from whose photographs it then renders.
 
-        For models that look at photographs, which have to be shown some before they render; of
-        several captures that were joined, the first that was never trained on is taken.
+        For models of many scenes. If several captures were joined, the first one that was held out is used.
 
         Raises:
-            InputError: the model knows its own scene alone, or cannot look at these photographs.
+            InputError: the model knows only its own scene, or cannot render from these photographs.
         """
         if not self.module.needs_photographs:
             raise InputError(f"This model knows the scene {self.scene.name} alone, and no other can be shown to it.")
@@ -98,12 +97,12 @@ class TrainedModel:
         return replace(self, checkpoint=replace(self.checkpoint, scene=scene_record(shown), given_cameras=None))
 
     def in_frame(self, scene: Scene) -> Scene:
-        """Return a scene in the frame of this model, with its refined cameras where it has some.
+        """Return a scene in the frame of this model, with its refined cameras, if any.
 
         A capture that is read with other settings (`frames`, `downscale`) may have another working frame.
 
         Raises:
-            InputError: it was read with another `space` than the model was trained in.
+            InputError: the scene was read with another `space` than the model was trained in.
         """
         return as_trained(scene, self.checkpoint)
 
@@ -120,7 +119,7 @@ class TrainedModel:
 
 
 def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
-    """Open a trained model: the newest checkpoint of a run folder, or a checkpoint, whoever wrote it.
+    """Load a trained model from the newest checkpoint of a run folder, or from a checkpoint.
 
     Nothing in the file is executed, and the capture is not needed.
 
@@ -129,7 +128,7 @@ def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
         *overrides: settings of the machine, as on the command line: "trainer=cpu", "trainer.tile_points=4096".
 
     Raises:
-        InputError: it is no checkpoint of this program, or is damaged.
+        InputError: the file is not a checkpoint of this package, or is damaged.
     """
     with in_words("render"):
         config, _ = compose_config("render", [f"ckpt={quoted(run)}", *overrides])

@@ -23,28 +23,28 @@ class TrainedRun:
     """A finished run."""
 
     folder: Path
-    """The run folder: checkpoints, pictures, TensorBoard's files, the film."""
+    """The run folder: checkpoints, images, TensorBoard files, the film."""
     psnr: float | None
-    """Mean PSNR of the test views in dB; the validation's where no evaluation was asked for."""
+    """Mean PSNR of the test views in dB; of the validation rays if `final.evaluate=false`."""
     metrics: dict[str, Any]
-    """The content of metrics.json: the mean of each metric, `per_image`, and how it was measured (`protocol`); empty
-    where no evaluation was asked for."""
+    """The content of metrics.json: the mean of each metric, `per_image`, and the `protocol`; empty if
+    `final.evaluate=false`."""
     model: TrainedModel
-    """As its last checkpoint has it."""
+    """The model of its last checkpoint."""
 
 
 def train(*overrides: str) -> TrainedRun:
     """Train as `nerf train` does, in this process, and return the run.
 
     `nl.train("scene=blender", "scene.root=data/lego", "model=fast", "trainer.max_steps=800")` takes the overrides of
-    the command line, `resume=auto` and `paths.output_dir=DIR` among them. Ctrl-C, or the notebook's stop button, ends
-    the run after the step, with a checkpoint to go on from.
+    the command line, including `resume=auto` and `paths.output_dir=DIR`. Ctrl-C, or the notebook's stop button, ends
+    the run after the current step, with a checkpoint to resume from.
 
     Args:
-        *overrides: settings, each as one text.
+        *overrides: settings, one string each.
 
     Raises:
-        InputError: anything in the settings or in the capture that makes no run; nothing is left half-written.
+        InputError: a setting or the capture is invalid; nothing is left half-written.
         KeyboardInterrupt: the run was stopped; its checkpoint is saved.
     """
     with in_words("train"), composed_job("train", prepared("train", list(overrides))) as config:

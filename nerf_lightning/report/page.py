@@ -43,7 +43,7 @@ class Report:
     worst: list[ViewOnPage] = field(default_factory=list)
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
-    """Pictures of one view while it was learnt."""
+    """Pictures of one view while it was learned."""
     curves: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)

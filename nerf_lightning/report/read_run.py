@@ -25,7 +25,7 @@ from nerf_lightning.visualization.camera_layout import coverage_picture
 MOST_STEPS = 24
 SCENE_PAGES = ("page.html", "export/page.html")
 """Of a run folder: where final.page and nerf export write the page of its scene."""
-VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learnt"}
+VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learned"}
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
 
 

@@ -118,7 +118,7 @@ def _of_ray(samples: RaggedSamples, ray: int) -> list[list[float]]:
 
 
 def _packed_samples() -> tuple[Tensor, Tensor, RaggedSamples, RaggedSamples]:
-    """Return densities, colours, samples, and the same in float64."""
+    """Return densities, colors, samples, and the same in float64."""
     random, counts = _generator(), torch.arange(RAYS) % (PACKED_SAMPLES + 1)
     index = torch.repeat_interleave(torch.arange(RAYS), counts)
     bounds = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])

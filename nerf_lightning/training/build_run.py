@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Run:
-    """What learns, and from what: all that Lightning's Trainer needs."""
+    """The system and the data that Lightning's Trainer needs."""
 
     settings: TrainerSettings
     scene: Scene
@@ -56,16 +56,16 @@ class Run:
 def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = None) -> Run:
     """Build what `nerf train OVERRIDES` trains, for `Trainer.fit(run.system, run.data)`; nothing is written.
 
-    Its weights are functions of the seed. A run is fitted once; to go on from a checkpoint, another is built.
+    The weights depend only on the seed. A run is fitted once; to resume from a checkpoint, build another.
 
     Args:
-        *overrides: as on the command line, like "scene=bricks" and "model=nerf_tiny".
-        model: one of your own in the place of the config's; its weights are drawn anew from the seed. A checkpoint of
-            it is opened by whoever builds it again, as here, with `ckpt_path`, and not by the commands.
-        loss: one of your own in the place of the config's.
+        *overrides: settings as on the command line, such as "scene=bricks" and "model=nerf_tiny".
+        model: your own model instead of the config's; its weights are drawn anew from the seed. Its checkpoints are
+            opened by building it again, as here, with `ckpt_path`, and not by the commands.
+        loss: your own loss instead of the config's.
 
     Raises:
-        InputError: anything in the settings or in the capture that makes no run, or a setting of Lightning's Trainer.
+        InputError: a setting or the capture is invalid, or a setting belongs to Lightning's Trainer.
     """
     _refuse_settings_of_the_trainer(overrides)
     config, choices = compose_config("train", overrides)
@@ -103,7 +103,7 @@ def assemble(
         config: of the run.
         choices: the names picked from each group, which its checkpoints keep.
         settings: of the machine.
-        scene: what is learnt.
+        scene: what is learned.
         model: one in the place of the config's.
         loss: the same.
     """
@@ -116,7 +116,7 @@ def assemble(
         start = read_checkpoint(required_path("init_from", config.init_from))
     step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
-        log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
+        log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch, depth_every=step.loss.depth_every

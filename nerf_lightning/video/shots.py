@@ -31,7 +31,7 @@ from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame, fram
 from nerf_lightning.video.paths.sweep import MIDDLE
 from nerf_lightning.video.settings import FilmSettings
 
-# The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
+# The range of the depth's colors is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 12, 64
 MOST_POINTS = 1000  # Of the content
 IN_MOST = 0.5  # Of the views: what these show in their middle is what the capture is about.
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Subject:
-    """A model to be filmed, and where it was learnt."""
+    """A model to be filmed, and where it was learned."""
 
     model: Model
     scene: SceneRecord
@@ -56,7 +56,7 @@ class Shot:
     subject: Subject
     cameras: Cameras
     seen_from: Cameras | None
-    """Cameras whose directions the colour is looked up from, where the camera itself is held."""
+    """Cameras whose directions the color is looked up from, where the camera itself is held."""
     near: Float[Tensor, "frames"]
     far: Float[Tensor, "frames"]
     clip: Clip | None
@@ -64,7 +64,7 @@ class Shot:
 
     @property
     def unit(self) -> float:
-        """How many metres, or where nobody knows units of the user's, make a unit of the scene's."""
+        """How many meters, or where nobody knows units of the user's, make a unit of the scene's."""
         return told_length(self.subject.scene)[0]
 
     @property
@@ -85,7 +85,7 @@ class Shot:
         return normals @ (to_user[:3, :3] / unit_of(to_user)).mT.to(normals)
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
-        """Return how far what the picture shows lies from the camera, in metres or the user's units (`unit`).
+        """Return how far what the picture shows lies from the camera, in meters or the user's units (`unit`).
 
         Along the camera's axis; of a panorama, which has none, along the ray.
         """
@@ -189,7 +189,7 @@ def depth_range(shots: list[Shot]) -> tuple[float, float]:
 
 
 def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
+    """Tell which cameras normalized device coordinates can render: before the plane z = -1, and looking along -z."""
     zeros = torch.zeros(len(cameras.c2w))
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
@@ -199,7 +199,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
     """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
     if scene.cameras.ndc is not None:
         raise InputError(
-            f"projection=equirectangular looks to all sides, and {scene.name} was learnt in normalised device "
+            f"projection=equirectangular looks to all sides, and {scene.name} was learned in normalized device "
             "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted."
         )
     if path.fov is not None:
@@ -221,7 +221,7 @@ def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Ca
 
 
 def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
-    """Return the cameras with rays through normalised device coordinates, where the scene was learnt in these."""
+    """Return the cameras with rays through normalized device coordinates, where the scene was learned in these."""
     if scene.cameras.ndc is None:
         return cameras
     count = len(cameras.c2w)

@@ -38,8 +38,8 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     config, choices = chosen_for(scene, "seed=3")
     assert choices["model"] == model
     assert (config.data.batch_rays, config.seed) == (batch_rays, 3)
-    assert f"model: {model}, since " in caplog.text
-    assert "(model=NAME chooses another)" in caplog.text
+    assert f"model: {model}, because " in caplog.text
+    assert "(choose another with model=NAME)" in caplog.text
 
 
 @pytest.mark.parametrize(("scene", "model"), [(IN_A_BOX, "fast"), (PHOTOGRAPHS, "fast_proposal")])

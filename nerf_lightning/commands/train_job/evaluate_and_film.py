@@ -104,7 +104,7 @@ def _page(asked: bool | str) -> PageExport | None:
 
 
 def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:
-    """Return the scene with the cameras that the run has learnt, and what a person reads about them."""
+    """Return the scene with the cameras that the run has learned, and what a person reads about them."""
     system: Any = trainer.lightning_module
     trained = scene.splits["train"]
     learnt = system.rays.refined(trained)
@@ -128,9 +128,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
-    fitted = (
-        "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB once each picture's colours are fitted"
-    )
+    fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
         f"({metrics['num_images']} views, {protocol['background']} background)",

@@ -54,7 +54,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         steps = trainer.global_step - (0 if former is None else former.step)
         log.info("%d steps in %s", steps, spoken(job.clock.seconds))
     if job.signals.received is not None:
-        log.info("stopped at step %d; go on with: %s", trainer.global_step, resume_command(folder.path))
+        log.info("stopped at step %d; resume with: %s", trainer.global_step, resume_command(folder.path))
         raise SystemExit(128 + job.signals.received)
     return trainer
 
@@ -84,7 +84,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     """Put the model on its device, in the precision and with the tile that suit it, or that the run began with."""
     step, settings, former = job.system.step, job.settings, folder.former
     if former is not None:
-        log.info("going on from step %d of %s", former.step, folder.path)
+        log.info("resuming from step %d of %s", former.step, folder.path)
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
         step.tile_points = settings.tile_points
@@ -116,11 +116,11 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         "whole batches" if tile is None else f"tiles of {tile} points",
     )
     if folder.former is None and job.config.resume == "auto":
-        log.info("resume=auto: there is no unfinished run of this config to go on with; this one begins anew")
+        log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new one")
     own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
     if own:
         log.info(
-            "the model has parts of your own: a command that opens its checkpoints builds them only with trust=%s",
+            "the model has parts of your own: commands that open its checkpoints need trust=%s",
             own[0] if len(own) == 1 else f"[{','.join(own)}]",
         )
 

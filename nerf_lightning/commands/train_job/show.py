@@ -82,7 +82,7 @@ def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
     except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         log.warning(
-            "The run is whole, but its page (final.page) could not be made: %s Once that is mended, "
+            "The run is whole, but its page (final.page) could not be made: %s Once that is fixed, "
             "nerf export ckpt=%s what=page makes it.",
             reason if reason.endswith(".") else f"{reason}.",
             folder,

@@ -55,25 +55,26 @@ class CaptureReader(Reader):
 
     Args:
         root: the capture's folder.
-        downscale: whole factor by which the photographs shrink; focal lengths follow. auto: so that their longer side
-            has at most 640 pixels, of which a few minutes on a CPU see enough.
-        hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
+        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that their
+            longer side has at most 640 pixels, enough for a few minutes on a CPU.
+        hold_every: the first and every k-th view after it are held out for evaluation, if the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
-        masks: a folder below root with masks, called like their photographs (or with .png added, or with .png for the
-            ending); a photograph without one is kept whole. null: no masks, or those that the format names.
-        masks_keep: the colour of masks that counts, white or black; the other is left out.
+        masks: a folder below root with masks, named like their photographs (or with .png added, or instead of the
+            extension); photographs without a mask are used whole. null: no masks, or those that the format names.
+        masks_keep: the color of masks that is kept, white or black; the other is ignored.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
-        near: distance at which content may begin, in the user's units; null: from the capture.
+        near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
-        metres_per_unit: how many metres a unit of the capture's frame is long, where it is known: then depths are told
-            in metres, and GLB files have their true size. No format of captures says it. null: unknown.
-        cut_out: where opaque photographs show a thing before one plain colour, make that transparent.
-        background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null:
-            black; where a plain background was cut out, white_or_random, black_or_random or random, as its colour is.
+        metres_per_unit: length of the capture's unit in meters, if known: depths are then in meters, and GLB files have
+            their true size. Capture formats do not store it. null: unknown.
+        cut_out: if opaque photographs show an object on a plain background, make that transparent.
+        background: the background of transparent pixels and of rays that leave the scene: white, black, random or none.
+            null: black; if a plain background was cut out, white_or_random, black_or_random or random, depending on its
+            color.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
-        allow_outside: follow names that lead out of root; false refuses them, since they may be a stranger's. Links
-            are followed always.
-        verify: compare the contents of all files with what was decoded, not their times alone.
+        allow_outside: follow names that lead out of root; false refuses them, because the capture may be untrusted.
+            Links are always followed.
+        verify: compare the contents of all files with the cache, not only their times.
         name: the scene's name in reports.
     """
 
@@ -103,7 +104,7 @@ class CaptureReader(Reader):
         """
 
     def read(self) -> Scene:
-        """Return the capture as a scene in a working frame: upright, centred, of a handy size.
+        """Return the capture as a scene in a working frame: upright, centered, of a handy size.
 
         Raises:
             InputError: a setting that makes no sense, or anything wrong with the files.
@@ -286,7 +287,7 @@ class CaptureReader(Reader):
             return {"train": train, "val": held, "test": held}
         if not splits["train"]:
             raise InputError(
-                f"{capture.source} names no view to learn from that is there. Mend its lists, or remove them so that "
+                f"{capture.source} names no view to learn from that is there. Fix its lists, or remove them so that "
                 f"every {self.hold_every}th view is held out."
             )
         held = splits["val"] or splits["test"]

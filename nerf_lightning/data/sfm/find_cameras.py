@@ -30,7 +30,7 @@ def find_cameras(
 ) -> SparseModel:
     """Find the cameras of photographs and write the largest model in COLMAP's binary form.
 
-    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in metres with
+    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in meters with
     z up where GPS tells (`align_to_gps`). Of several attempts, the one that places most photographs counts.
 
     Args:

@@ -41,14 +41,15 @@ class SplatsExport(Export):
     """Write `splats.ply`, `.spz` or `.glb`, `splats.json` with what was measured, and `splats.png` to look at.
 
     Args:
-        num_splats: at most so many; auto: 200 for each pixel of a view's side, at most 150,000.
-        seconds: of fitting to the training photographs; without them, or where the model has a correction for each
-            camera, to pictures of the field; 0: as they lie on the field's surfaces.
-        sh_degree: of the spherical harmonics of colours, 0 to 3.
-        format: of the file. SPZ needs `pip install 'nerf-lightning[splats]'`.
-        longest: pixels of the longer side of the pictures that are fitted to, at most.
-        max_views: most held-out views that splats and field are compared on.
-        seed: of the splats that are drawn, and of the order of views.
+        num_splats: maximum number of splats; auto: 200 per pixel of a view's side, at most 150,000.
+        seconds: seconds of fitting to the training photographs, or to renders of the field without them or if the model
+            has a correction per photograph; 0: splats on the field's surfaces.
+        sh_degree: degree of the spherical harmonics of colors, 0 (no view dependence) to 3.
+        format: ply, spz (a sixth of the bytes; needs `pip install 'nerf-lightning[splats]'`) or glb (glTF with
+            KHR_gaussian_splatting).
+        longest: maximum length of the longer side of the photographs used for fitting, in pixels.
+        max_views: maximum number of held-out views for comparing splats and field.
+        seed: the seed of the initial splats and of the order of views.
     """
 
     needs_photographs = True
@@ -153,7 +154,7 @@ class SplatsExport(Export):
 
 
 def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras) -> list[View]:
-    """Return the photographs that the model learnt from, by its record, and of which anything counts."""
+    """Return the photographs that the model learned from, by its record, and of which anything counts."""
     trained = {record.view_names[view] for view in record.splits["train"]}
     known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
     views = [photographed(scene, view, pinholes) for view in known]
@@ -167,7 +168,7 @@ def extent(cameras: Cameras) -> float:
 
 
 def to_gltf(record: SceneRecord) -> Float[Tensor, "4 4"]:
-    """Return what takes the capture's frame to glTF's, where y is up and a unit is a metre, as far as that is known."""
+    """Return what takes the capture's frame to glTF's, where y is up and a unit is a meter, as far as that is known."""
     up = directions_to_user(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), record.to_user.double())
     matrix = y_up(up)
     matrix[:3] *= record.metres_per_unit or 1.0

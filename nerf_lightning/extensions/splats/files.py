@@ -30,7 +30,7 @@ LARGEST_PLACE = 1 << 23  # And so many steps from the origin.
 
 
 def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
-    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colours."""
+    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colors."""
     unit = unit_of(matrix)
     rotation = matrix[:3, :3] / unit
     axes = rotation @ rotation_from_quaternion(gaussians.quaternions.double())
@@ -47,7 +47,7 @@ def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
 def turned_harmonics(
     sh_rest: Float[Tensor, "n coefficients 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n coefficients 3"]:
-    """Return the coefficients of the same colours in a turned frame.
+    """Return the coefficients of the same colors in a turned frame.
 
     The harmonics of a degree turn among themselves: Y(R^T d) = Y(d) M for every direction d. Here M is what least
     squares finds for more directions than harmonics, which is exact.
@@ -68,7 +68,7 @@ def save_splats(path: Path, gaussians: Gaussians, to_gltf: Float[Tensor, "4 4"])
     Args:
         path: .ply, .spz or .glb.
         gaussians: in the capture's frame.
-        to_gltf: similarity that takes that to glTF's, where y is up and a unit is a metre; no other format has one.
+        to_gltf: similarity that takes that to glTF's, where y is up and a unit is a meter; no other format has one.
     """
     writers = {".ply": ply_bytes, ".spz": None, ".glb": lambda splats: glb_bytes(moved(splats, to_gltf))}
     write = writers[path.suffix]

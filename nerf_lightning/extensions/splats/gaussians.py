@@ -38,10 +38,10 @@ class Gaussians:
     log_scales: Float[Tensor, "n 3"]
     """Logarithms of the standard deviations along the splat's own axes, in scene units."""
     quaternions: Float[Tensor, "n 4"]
-    """(w, x, y, z) of the rotation whose columns are the splat's axes; normalised wherever it is used."""
+    """(w, x, y, z) of the rotation whose columns are the splat's axes; normalized wherever it is used."""
     opacity_logits: Float[Tensor, "n"]
     sh_dc: Float[Tensor, "n 3"]
-    """Spherical harmonics of the colour, which is 0.5 plus their sum, and not below 0: the one that is constant,"""
+    """Spherical harmonics of the color, which is 0.5 plus their sum, and not below 0: the one that is constant,"""
     sh_rest: Float[Tensor, "n coefficients 3"]
     """and the 0, 3, 8 or 15 of degree 1 to 3."""
 
@@ -126,7 +126,7 @@ def jacobian_limits(camera: Pinhole) -> tuple[float, float]:
 
 
 def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-    """Return the colours seen from a place; no gradient goes through the direction, which hardly moves."""
+    """Return the colors seen from a place; no gradient goes through the direction, which hardly moves."""
     directions = normalize(gaussians.means.detach() - eye, dim=-1)
     basis = SphericalHarmonicsEncoder(gaussians.sh_degree + 1)(directions)
     sh = torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], dim=1)
@@ -134,5 +134,5 @@ def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"
 
 
 def dc_of_color(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return the constant coefficient of a colour that is the same from everywhere."""
+    """Return the constant coefficient of a color that is the same from everywhere."""
     return (rgb - 0.5) / DEGREE_1

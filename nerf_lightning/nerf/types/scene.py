@@ -13,7 +13,7 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
 """What lies behind the scene.
 
-`random`: a colour drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
+`random`: a color drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
 `white_or_random`: the same, but white behind pixels that may show some of a background that was cut out (`UNSURE`).
 `black_or_random`: the same with black, which it is at evaluation, too. `none`: nothing. The last interval of a dense
 level takes all the light that is left; levels behind an occupancy grid have no such interval, and leave it black.
@@ -29,7 +29,7 @@ LensModel = Literal["pinhole", "radial_tangential", "fisheye", "equirectangular"
 panoramas, which show all directions, in `geometry.panoramas`."""
 
 Space = Literal["bounded", "ndc", "contracted"]
-"""How much of the world is modelled: a box, all that lies in front of a near plane (normalised device coordinates), or
+"""How much of the world is modeled: a box, all that lies in front of a near plane (normalized device coordinates), or
 everything, contracted around a box."""
 
 
@@ -38,7 +38,7 @@ class Cameras(TensorStruct):
     """Cameras, one per view, through lenses of one kind."""
 
     c2w: Float[Tensor, "*views 3 4"]
-    """Camera-to-world; the columns are right, up, back and the camera's centre."""
+    """Camera-to-world; the columns are right, up, back and the camera's center."""
     focal: Float[Tensor, "*views 2"]
     """Focal lengths in pixels along x and y; of panoramas, pixels per radian."""
     center: Float[Tensor, "*views 2"]
@@ -52,7 +52,7 @@ class Cameras(TensorStruct):
     height: Int[Tensor, "*views"]
     """Image height in pixels."""
     ndc: Float[Tensor, "*views 2"] | None = None
-    """Focal length over half the image's size, where rays run through normalised device coordinates (`geometry.ndc`)
+    """Focal length over half the image's size, where rays run through normalized device coordinates (`geometry.ndc`)
     and the world's z axis is the captures' back; None: rays run through the world."""
 
 
@@ -98,7 +98,7 @@ class Truth:
     """The exact geometry of each pixel, where a scene knows it. Flat like the pixel store."""
 
     depth: Float[Tensor, "pixels"]
-    """Distance along the unit ray through the pixel's centre to the first surface; inf where there is none."""
+    """Distance along the unit ray through the pixel's center to the first surface; inf where there is none."""
     normals: Float[Tensor, "pixels 3"]
     """Unit surface normal in world axes, facing the camera; zero where there is no surface."""
 
@@ -121,7 +121,7 @@ class SceneRecord:
     view_names: tuple[str, ...]
     background: Background
     to_user: Float64[Tensor, "4 4"]
-    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of metres."""
+    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of meters."""
     space: Space = "bounded"
     metres_per_unit: float | None = None
     """How long a unit of the user's frame is; None: nobody has said."""
@@ -160,4 +160,4 @@ class Scene(SceneRecord):
     left_out: tuple[str, ...] = ()
     """Photographs of the capture that have no pose, and so are no views."""
     refined: bool = False
-    """Whether its cameras learn with the model, or have learnt: they stand near where the photographs were taken."""
+    """Whether its cameras learn with the model, or have learned: they stand near where the photographs were taken."""

@@ -21,10 +21,10 @@ class CollapseGuard(Callback):
     With ReLU densities and a white background a run may fall into "all is empty", where no gradient leads out. The sign
     is the spread (standard deviation over rays) of the scene's own light, before the background: below
     `ratio` times the spread of the targets at `patience` looks in a row. The restart draws new weights, a new order
-    of rays, and goes through the centre crop again; steps already taken are not given back.
+    of rays, and goes through the center crop again; steps already taken are not given back.
 
     Args:
-        every_steps: steps between two looks.
+        every_steps: steps between two histograms.
         until_step: steps after the crop from which on the guard trusts the run.
         patience: looks in a row that must fail.
         ratio: smallest share of the targets' spread that counts as alive.

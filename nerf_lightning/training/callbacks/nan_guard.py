@@ -26,12 +26,12 @@ class NanGuard(Callback):
     already taken are not given back. Rate and attempt are part of the checkpoints that follow.
 
     Args:
-        on_nan: stop ends the run; rollback goes back to the last good checkpoint, and on at a lower rate.
-        patience: so many bad steps in a row are too many.
-        factor: what a rollback multiplies the learning rate by.
-        max_rollbacks: how often it rolls back before it stops.
-        every_steps: steps between two looks at the weights, and at the count of bad steps where reading it would
-            stop the device (elsewhere it is read at each step).
+        on_nan: stop ends the run; rollback returns to the last good checkpoint and continues at a lower learning rate.
+        patience: the number of consecutive bad steps that triggers it.
+        factor: the factor by which a rollback multiplies the learning rate.
+        max_rollbacks: the maximum number of rollbacks before it stops.
+        every_steps: steps between checks of the weights, and of the count of bad steps on devices that reading it would
+            stall (elsewhere it is read in each step).
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class NanGuard(Callback):
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
         good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.step.progress
         if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
-            raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
+            raise InputError(f"{cause}, so the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
         place = f"checkpoint {good}" if good is not None else "beginning, with new weights, as no checkpoint was saved"
         rate = system.optimizers().param_groups[0]["base_lr"]

@@ -23,7 +23,7 @@ class Watcher(Callback):
     Nothing that training reads may be changed.
 
     Args:
-        every_steps: steps between two looks.
+        every_steps: steps between two histograms.
     """
 
     def __init__(self, every_steps: int):

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
 CROSSED_BY_A_CIRCLE, CROSSED, TIMES_THE_USUAL = 75.0, 25.0, 3.0
-"""Degrees between neighbouring photographs, seen from above, over which a path may lead: these, or so many times the
+"""Degrees between neighboring photographs, seen from above, over which a path may lead: these, or so many times the
 median where photographs lie farther apart; a circle over at most the first."""
 OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
 NEAREST, FARTHEST = 0.1, 0.9
@@ -69,7 +69,7 @@ class Sweep(CameraPath):
             cameras = self.pinholes(look_at(eyes, middle.expand_as(eyes), up), around)
             farthest = math.inf if around.bounded else float(torch.quantile(distances, FARTHEST))
             return step_back(cameras, content, (farthest - distance).clamp(min=0.0))
-        # Aimed as those nearby, of whose axes this is the point nearest to the centre.
+        # Aimed as those nearby, of whose axes this is the point nearest to the center.
         axes = -around.poses[:, :, 2]
         aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
         return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)

@@ -99,7 +99,7 @@ TRANSFORMS = {
         frame(2, transform_matrix=[[float("nan")] * 4] * 3),
         r"transform_matrix holds NaN or infinity: this view",
     ),
-    "a camera far away": (frame(0, transform_matrix=AT_THE_END), r"p_0.png has .*a centre beyond 1e\+09, where no"),
+    "a camera far away": (frame(0, transform_matrix=AT_THE_END), r"p_0.png has .*a center beyond 1e\+09, where no"),
     "a frame twice": (frame(2, file_path="./images/p_1.png"), r"lists images/p_1.png more than once, with different p"),
     "fl_x of zero": (top(fl_x=0.0), r"the view images/p_0.png has the focal length 0, 20"),
     "intrinsics with NaN": (top(cx=float("nan")), r"the view images/p_0.png has a pose or intrinsics with NaN"),
@@ -116,7 +116,7 @@ TRANSFORMS = {
     "an absent mask": (frame(1, mask_path="a.png"), r"of 1 files \(mask_path\) 1 are not there, or no pictures: a.png"),
     "a mask of another size": (mask((4, 4)), r"The mask \S+m.png has 4 x 4 pixels, but its photograph \S+p_1.png has"),
     "a split of absent views": (top(train_filenames=["a\nb"]), r"names no view to learn from that is there"),
-    "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Mend it"),
+    "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Fix it"),
     "nothing held out": (top(train_filenames=TWO), r"names no view to judge by that is there: every 8th"),
     "a shear": (top(applied_transform=SHEARED), r"applied_transform must turn, move and scale alike along all axes"),
     "words": (top(applied_transform="none"), r"applied_transform is not a 4 x 4 matrix of numbers"),
@@ -183,7 +183,10 @@ LLFF = {
         lambda root: (root / "images").rename(root / "pictures"),
         r"has no photographs in images, .* the folder itself",
     ),
-    "one place": (cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]), r"All 9 cameras of \S+poses_bounds.npy stand at one place"),
+    "one place": (
+        cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]),
+        r"All 9 cameras of \S+poses_bounds.npy are at the same position",
+    ),
     "one view": (first_alone, r"Holding out views from 1 leaves 0 to learn from and 1 to judge by"),
 }
 
@@ -238,7 +241,7 @@ COLMAP = {
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
-    "an empty model": (emptied, r"has no registered photograph, so nothing can be learnt. Copy the model again, or"),
+    "an empty model": (emptied, r"has no registered photograph, so nothing can be learned. Copy the model again, or"),
     "a tail": (
         text(IMAGES, lambda old: old + b"tail"),
         r"images.bin cannot be read \(ValueError: it announces \S+ bytes, and has",

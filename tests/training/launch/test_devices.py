@@ -38,7 +38,7 @@ def test_a_gpu_that_cannot_be_used_leaves_the_work_to_the_cpu_unless_it_was_aske
     with caplog.at_level(logging.WARNING):
         assert working_device(CHOSEN, "auto") == ("cpu", "the GPU cannot be used")
     assert TROUBLES[answer] in caplog.text
-    assert "The CPU computes instead" in caplog.text
+    assert "The CPU is used instead" in caplog.text
     with pytest.raises(InputError, match="torch sees a GPU here") as refused:
         working_device(CHOSEN, "gpu")
     assert TROUBLES[answer] in str(refused.value)

@@ -125,7 +125,7 @@ def test_the_yaml_lists_the_constructors_defaults(name):
 
 
 def ring(degrees, elevation=40.0, radius=4.0):
-    """Cameras that look at the frame's centre from azimuths in degrees."""
+    """Cameras that look at the frame's center from azimuths in degrees."""
     azimuth, height = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)), math.radians(elevation)
     level = torch.stack([azimuth.cos(), azimuth.sin()], dim=-1) * math.cos(height)
     offsets = torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)

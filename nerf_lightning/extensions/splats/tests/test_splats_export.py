@@ -104,7 +104,7 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
 
 
 def test_normalised_device_coordinates_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"what=splats: ball was trained in normalised device coordinates"):
+    with pytest.raises(InputError, match=r"what=splats: ball was trained in normalized device coordinates"):
         exported(tmp_path, solid(ball()), replace(ball_scene(), space="ndc"))
     assert not list(tmp_path.iterdir())
 

@@ -99,7 +99,7 @@ def test_what_it_cannot_look_at_or_tell_is_refused_by_name():
         looking_model(ball_scene(), [0, 1, 2], num_sources=4)
     with pytest.raises(InputError, match=r"scene\.background=white"):
         looking_model(ball_scene(background="random"))
-    with pytest.raises(InputError, match="ViewTransformer renders rays and has neither density nor colour"):
+    with pytest.raises(InputError, match="ViewTransformer renders rays and has neither density nor color"):
         point_field(looking_model())
     for changes in ({"width": 10, "heads": 4}, {"image_scale": 3}, {"experts": 2}, {"blocks": 0}):
         with pytest.raises(ValueError, match=next(reversed(changes))):
