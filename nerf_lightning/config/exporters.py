@@ -17,8 +17,8 @@ from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS, backend
 
-OTHERS_IN_FINAL = ("evaluate", "video", "report")
-"""What `nerf train` does at its end beside exporting."""
+NO_EXPORTERS = ("evaluate", "video", "report")
+"""Keys of `final` that name no exporter."""
 
 
 def exporter_class(name: str) -> Any:
@@ -33,7 +33,7 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     Raises:
         InputError: there is no such exporter or setting, or its value makes no sense.
     """
-    asked = {name: value for name, value in final.items() if name not in OTHERS_IN_FINAL and value is not False}
+    asked = {name: value for name, value in final.items() if name not in NO_EXPORTERS and value is not False}
     return {str(name): _exporter(str(name), value) for name, value in asked.items()}
 
 

@@ -76,7 +76,7 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
     except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         log.warning(
-            "The run is whole, but final.%s failed: %s Once that is mended, nerf export ckpt=%s what=%s writes it.",
+            "The run is whole, but final.%s failed: %s nerf export ckpt=%s what=%s writes it later.",
             name,
             reason if reason.endswith(".") else f"{reason}.",
             folder,
