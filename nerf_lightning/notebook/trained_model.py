@@ -126,9 +126,8 @@ class TrainedModel:
         """
         if self.module.needs_photographs:
             raise InputError("This model renders from photographs: give those to nerf export with scene=....")
-        given = {"ckpt": self.checkpoint.path, "what": what, "paths.output_dir": folder}
-        given |= {f"what.{key}": value for key, value in settings.items()}
-        overrides = [f"{key}={quoted(value)}" for key, value in given.items()]
+        overrides = [f"ckpt={quoted(self.checkpoint.path)}", f"what={what}", f"paths.output_dir={quoted(folder)}"]
+        overrides += [f"what.{key}={quoted(value)}" for key, value in settings.items()]
         with in_words("export"), composed_job("export", prepared("export", overrides)) as config:
             return export_checkpoint(config)
 
