@@ -9,6 +9,7 @@ from pathlib import Path
 from traceback import extract_tb
 
 from hydra.errors import HydraException, InstantiationException
+from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.config.lightning_arguments import OWNED
@@ -94,7 +95,7 @@ def explain(error: BaseException, command: str) -> str:
         if isinstance(link, InputError):
             return str(link)
         if isinstance(link, MissingMandatoryValue):
-            return _not_given(getattr(link, "full_key", None) or str(link), command)
+            return _not_given(link, command)
     if isinstance(error, InstantiationException):
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
@@ -117,14 +118,16 @@ def explain(error: BaseException, command: str) -> str:
     return unknown_name(message, command) or f"{message} {ALL_OF.format(command)}"
 
 
-def _not_given(key: str, command: str) -> str:
+def _not_given(error: MissingMandatoryValue, command: str) -> str:
+    key = error.full_key or str(error)
     if key not in ("ckpt", "run"):
         return f"nerf {command} needs {key}: add {key}=VALUE. nerf help {key} tells what it is."
-    last = max(Path("outputs").glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
+    root = OmegaConf.select(error.parent_node._get_root(), "paths.root_dir") if error.parent_node else "outputs"
+    last = max(Path(root).glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
     if last is None:
-        return f"nerf {command} needs a run, and outputs/ holds none: train one, or name its folder with {key}=DIR."
+        return f"nerf {command} needs a run, and {root}/ holds none: train one, or name its folder with {key}=DIR."
     newest = shlex.quote(str(last.parent.parent))  # cli/quoting.py does the rest
-    return f"nerf {command} needs a run. For the newest below outputs/, type: nerf {command} {key}={newest}"
+    return f"nerf {command} needs a run. For the newest below {root}/, type: nerf {command} {key}={newest}"
 
 
 def _chain(error: BaseException | None) -> list[BaseException]:

@@ -63,8 +63,8 @@ def key_of(override: str) -> str:
 def open_sections(overrides: Iterable[str]) -> list[str]:
     """Return overrides that Hydra takes for sections whose keys it does not know, without a + from the user.
 
-    >>> open_sections(["trainer.lightning.profiler=simple", "final.mesh=true", "seed=1"])
-    ['++trainer.lightning.profiler=simple', '++final.mesh=true', 'seed=1']
+    >>> open_sections(["trainer.lightning.profiler=simple", "final.page=true", "seed=1"])
+    ['++trainer.lightning.profiler=simple', '++final.page=true', 'seed=1']
     """
     return [f"++{override}" if OPEN_SECTIONS.match(override) else override for override in overrides]
 

@@ -103,8 +103,8 @@ def test_a_model_is_exported_as_by_the_command(run, tmp_path):
         (lambda model: model.render(0, background="blue"), ("blue",)),
         (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
         (lambda model: model.path(num_frames=0), ("num_frames",)),
-        (lambda model: model.export("meshes"), ("meshes", "mesh")),
-        (lambda model: model.export("mesh", faces=-1), ("what.faces=-1",)),
+        (lambda model: model.export("pages"), ("pages", "page")),
+        (lambda model: model.export("page", resolution=3), ("what.resolution=3",)),
         (lambda model: nl.load("nowhere"), ("no checkpoint",)),
     ],
 )

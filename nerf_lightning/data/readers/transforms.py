@@ -47,6 +47,8 @@ class TransformsReader(CaptureReader):
         depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
     """
 
+    named_by = (".json",)
+
     name: str = "transforms"
     file: str | None = None
     depth_unit: float = 1e-3
