@@ -73,7 +73,7 @@ def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = N
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     scene: Scene = build(config.scene).read()
-    config, choices = resolve_auto(config, choices, overrides, scene)
+    config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type == "cuda")
     config, choices = resolve_correction(config, choices, overrides)
     run = assemble(config, choices, settings, scene, model, loss)
     settings.prepare(run.system.model)

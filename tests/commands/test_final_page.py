@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import pytest
 from support.baked_ball import all_around, record_of
@@ -48,6 +49,9 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     report = (exported.parent / "report.html").read_text()
     assert 'href="./export/page.html">Walk around' in report
     assert 'href="./export/transforms.json">transforms.json (0.' in report
+    last = result.out.splitlines()[-1]
+    found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it: .+\."
+    assert re.fullmatch(found, last), last
     assert (seen["quality"], seen["training"]) == ("small", False)
     assert len(seen["beside"].photographs.view_names) == 10
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)

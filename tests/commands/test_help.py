@@ -34,7 +34,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert result.out.startswith("data.sample_budget=131072\n")
     assert "so that a step has about so many samples; null: they do not." in " ".join(result.out.split())
     assert "Takes int | null." in result.out
-    assert "model=fast_large 524288" in " ".join(result.out.split())
+    assert "model=fast_large 262144" in " ".join(result.out.split())
     result = nerf("train", "--help", "scene=colmap")
     assert result.out == nerf("help", "scene=colmap").out == nerf("help", "train", "scene=colmap").out
     assert "A COLMAP reconstruction" in result.out

@@ -50,16 +50,17 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(f"report       {target}", *_result(job, psnr))
+        say(_result(job, target, psnr))
 
 
-def _result(job: TrainJob, psnr: float | None) -> list[str]:
-    """Return what came out of the photographs, and what would improve it most."""
-    used = len(job.scene.view_names)
+def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
+    """Return the last line: the page, what came out of the photographs, and what would improve it most."""
+    used, seconds = len(job.scene.view_names), job.config.budget.seconds
+    total = used + len(job.scene.left_out)
     quality = "" if psnr is None else f"{psnr:.1f} dB on photographs held out, "
-    lines = [f"result       {quality}{used} of {used + len(job.scene.left_out)} photographs used"]
-    cure = advice(job.checks or ())
-    return lines if cure is None else [*lines, f"to improve   {cure}"]
+    longer = "train longer" if seconds is None else f"budget.seconds={2 * seconds:g} trains twice as long"
+    cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
+    return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
 
 
 def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None:

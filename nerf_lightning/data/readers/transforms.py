@@ -128,7 +128,12 @@ class TransformsReader(CaptureReader):
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
-                "%s: of %d files (%s) %d are not there: %s", path, len(wanted), key, len(absent), listed(absent, 3)
+                "%s: of %d files (%s) %d are not there, or no pictures: %s",
+                path,
+                len(wanted),
+                key,
+                len(absent),
+                listed(absent, 3),
             )
         return [None if name is None else files.get(name) for name in names]
 
