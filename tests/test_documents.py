@@ -18,6 +18,7 @@ from nerf_lightning import build_run
 from nerf_lightning.cli.help import completion, help_on_anything
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
 from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.overrides import open_sections
 from nerf_lightning.files.folders import conf_folders
 
 ROOT = Path(__file__).parents[1]
@@ -169,7 +170,7 @@ def test_a_command_composes(command):
         ]
     bare = [word for word in words if "=" not in word]
     assert not bare or name in TAKE_PATHS, f"{bare} are no settings"
-    compose_config(name, [word for word in words if "=" in word])
+    compose_config(name, open_sections(word for word in words if "=" in word))
 
 
 def known_settings():
@@ -188,6 +189,8 @@ def known_settings():
         shared = {"capture": "scene"}.get(file.stem, "") if group == "." else group
         prefix = "" if "@package _global_" in text else shared.replace("/", ".")
         gather(yaml.safe_load(text) or {}, prefix)
+        if group == "what":
+            gather(yaml.safe_load(text) or {}, f"final.{file.stem}")
         keys.add(group)
     return keys
 

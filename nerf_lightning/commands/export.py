@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
+from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.export.base import Export, PageExtras
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say
@@ -40,10 +40,10 @@ def run(config: DictConfig) -> None:
     on_all_processes("export", config, export)
 
 
-def export(config: DictConfig) -> None:
+def export(config: DictConfig) -> list[Path]:
     """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
     if not ranks.is_first():
-        return
+        return []
     what: Export = build(config.what)
     path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
@@ -51,17 +51,26 @@ def export(config: DictConfig) -> None:
     if what.needs_density:
         point_field(opened.model)
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
-    record = opened.checkpoint.scene
-    content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
-    what.beside = beside(opened.checkpoint, photographs, path, content)
     default = beside_checkpoint(opened.checkpoint.path, "export")
-    with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
-        if opened.model.needs_photographs:
-            record = scene_record(scene_to_look_at(opened, None))
-        written = what.export(opened.model, record, folder, opened.tile_points)
+    with filled_folder(config.paths.output_dir, default) as folder:
+        written = write_files(what, opened, photographs, path, folder)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are the refined ones (refinement=...), not those that were read")
     say(*map(str, written))
+    return written
+
+
+def write_files(
+    what: Export, opened: LoadedModel, photographs: Scene | None, path: CameraPath | None, folder: Path
+) -> list[Path]:
+    """Export an opened model into a folder, which is there, and return the files."""
+    record = opened.checkpoint.scene
+    content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
+    what.beside = beside(opened.checkpoint, photographs, path if what.plays_path else None, content)
+    if opened.model.needs_photographs:
+        record = scene_record(scene_to_look_at(opened, None))
+    with torch.no_grad():
+        return what.export(opened.model, record, folder, opened.tile_points)
 
 
 def beside(

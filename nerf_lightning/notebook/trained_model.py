@@ -3,13 +3,16 @@
 import os
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.checkpoints.recorded_frame import as_trained
-from nerf_lightning.config.compose import compose_config
+from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.commands.export import export as export_checkpoint
+from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.open_checkpoint import open_checkpoint
@@ -105,6 +108,29 @@ class TrainedModel:
             InputError: the scene was read with another `space` than the model was trained in.
         """
         return as_trained(scene, self.checkpoint)
+
+    def export(self, what: str, folder: str | os.PathLike[str] | None = None, **settings: Any) -> list[Path]:
+        """Write files for other programs, as `nerf export` does: `model.export("splats", format="spz")`.
+
+        The checkpoint is read again, in float32, and so are the photographs of its run where the exporter needs them.
+
+        Args:
+            what: the exporter, of `conf/what/`: mesh, points, splats, page, ...
+            folder: where to; None: the folder `export` of the run.
+            **settings: of the exporter, as `nerf help export what=mesh` lists them.
+
+        Returns:
+            The files.
+
+        Raises:
+            InputError: an unknown exporter or setting, or a model in which there is nothing to export.
+        """
+        if self.module.needs_photographs:
+            raise InputError("This model renders from photographs: give those to nerf export with scene=....")
+        overrides = [f"ckpt={quoted(self.checkpoint.path)}", f"what={what}", f"paths.output_dir={quoted(folder)}"]
+        overrides += [f"what.{key}={quoted(value)}" for key, value in settings.items()]
+        with in_words("export"), composed_job("export", prepared("export", overrides)) as config:
+            return export_checkpoint(config)
 
     def _view(self, camera: int | str) -> int:
         names = self.scene.view_names

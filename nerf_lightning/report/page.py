@@ -36,6 +36,8 @@ class Report:
     subtitle: str = ""
     scene_page: str = ""
     """The address of the page on which the scene can be walked around in."""
+    exports: Pairs = field(default_factory=list)
+    """Files for other programs: label and address."""
     facts: Pairs = field(default_factory=list)
     """The numbers on top: label and value."""
     missing: list[str] = field(default_factory=list)

@@ -88,6 +88,12 @@ def test_a_view_is_rendered_by_number_name_and_camera_and_a_path_camera_by_camer
     assert run.model.render(cameras[1:2]).depth.shape == (4, 5)
 
 
+def test_a_model_is_exported_as_by_the_command(run, tmp_path):
+    assert run.model.export("cameras", tmp_path, images="photos")[0] == tmp_path / "transforms.json"
+    assert '"file_path": "photos/' in (tmp_path / "transforms.json").read_text()
+    assert run.model.export("cameras")[0].parent == run.folder / "export"
+
+
 @pytest.mark.parametrize(
     ("ask", "parts"),
     [
@@ -97,6 +103,8 @@ def test_a_view_is_rendered_by_number_name_and_camera_and_a_path_camera_by_camer
         (lambda model: model.render(0, background="blue"), ("blue",)),
         (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
         (lambda model: model.path(num_frames=0), ("num_frames",)),
+        (lambda model: model.export("pages"), ("pages", "page")),
+        (lambda model: model.export("page", resolution=3), ("what.resolution=3",)),
         (lambda model: nl.load("nowhere"), ("no checkpoint",)),
     ],
 )

@@ -82,6 +82,7 @@ def assemble_job(
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
     run = assemble(config, picked, settings, scene)
+    post_training.require_density(run.system.model)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     signals, clock = StopSignals(), TrainingTime()
     if config.print_config and ranks.is_first():

@@ -78,8 +78,9 @@ class Pinhole:
 
     @classmethod
     def of(cls, cameras: Cameras, view: int, near: float) -> "Pinhole":
-        """Return one of the cameras without its lens."""
+        """Return one of the cameras without its lens; in normalized device coordinates content begins at z = -1."""
         c2w = cameras.c2w[view]
+        near = near if cameras.ndc is None else 1.0 + float(c2w[2, 3])
         (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
         size = int(cameras.width[view]), int(cameras.height[view])
         return cls(TURN.to(c2w)[:, None] * c2w[:, :3].mT, c2w[:, 3], (fx, fy), (cx, cy), *size, near)

@@ -152,9 +152,8 @@ def point_field(model: Model) -> PointField:
     if isinstance(model, PointField):
         return model
     raise InputError(
-        f"{type(model).__name__} renders rays and has neither density nor color at points, so there is nothing to "
-        "make a mesh, points, a volume or a page of. nerf render films it; for the others train a model of the scene, "
-        "such as model=fast."
+        f"{type(model).__name__} renders rays and has neither density nor color at points, so neither surfaces nor "
+        "volumes can be exported. nerf render films it; for the others train a model of the scene, such as model=fast."
     )
 
 
