@@ -19,7 +19,7 @@ _OFFERED = {
     "Scene": "nerf_lightning.nerf.types.scene",
     "TrainedModel": "nerf_lightning.notebook.trained_model",
     "TrainedRun": "nerf_lightning.notebook.trained_run",
-    "build_run": "nerf_lightning.training.build_run",
+    "build_run": "nerf_lightning.notebook.run",
     "load": "nerf_lightning.notebook.trained_model",
     "read": "nerf_lightning.notebook.captures",
     "train": "nerf_lightning.notebook.trained_run",
