@@ -8,7 +8,7 @@ import importlib
 import zlib  # noqa: F401  before pycolmap, which brings another that Pillow's PNGs would be mixed with
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _OFFERED = {
     "Cameras": "nerf_lightning.nerf.types.scene",
