@@ -6,26 +6,23 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
-from support.orbit import LENS, orbit_images, orbit_masks, orbit_poses
+from support.orbit import LENS, SIZE, orbit_cameras, orbit_masks, orbit_scene
 from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning as nl
 from nerf_lightning.training.step import TrainStep
 
-SIZE = (12, 10)
 SMALL = ("model=nerf_tiny", "trainer=cpu", "data.batch_rays=64", "data.crop_steps=3")
-MATRIX = torch.tensor([[14.0, 0.0, 6.0], [0.0, 14.0, 5.0], [0.0, 0.0, 1.0]])
 
 
 @pytest.fixture(params=[False, True], ids=["radial_tangential", "fisheye"])
 def scene(request):
-    cameras = nl.Cameras.from_opencv(orbit_poses(6), MATRIX, SIZE, torch.tensor(LENS), fisheye=request.param)
-    return nl.Scene.from_cameras(orbit_images(6, SIZE), cameras, masks=orbit_masks(6, SIZE), name="orbit")
+    return orbit_scene(orbit_cameras(distortion=torch.tensor(LENS), fisheye=request.param), masks=orbit_masks(6, SIZE))
 
 
 @pytest.fixture
 def pinholes():
-    return nl.Scene.from_cameras(orbit_images(6, SIZE), nl.Cameras.from_opencv(orbit_poses(6), MATRIX, SIZE))
+    return orbit_scene()
 
 
 @pytest.fixture
@@ -89,9 +86,7 @@ def test_the_file_is_a_checkpoint_and_cameras_are_the_users_own(scene, tmp_path)
     list(run.steps(2))
     run.save(tmp_path / "run.ckpt")
     loaded = nl.load(tmp_path / "run.ckpt", "trainer=cpu")
-    camera = nl.Cameras.from_opencv(
-        orbit_poses(6), MATRIX, SIZE, torch.tensor(LENS), fisheye=scene.cameras.lens_model == "fisheye"
-    )[4]
+    camera = orbit_cameras(distortion=torch.tensor(LENS), fisheye=scene.cameras.lens_model == "fisheye")[4]
     view, seen = run.model.render(4), loaded.render(camera)
     torch.testing.assert_close(seen.rgb, view.rgb, rtol=0, atol=1e-4)
     torch.testing.assert_close(loaded.render("view_0004").depth, view.depth)

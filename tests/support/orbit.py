@@ -5,10 +5,13 @@ import math
 import numpy as np
 import torch
 
+import nerf_lightning as nl
 from nerf_lightning.nerf.geometry.poses import flip_yz, look_at
 
 LENS = (0.1, -0.02, 0.001, -0.002)
 """k1, k2, p1, p2."""
+SIZE = (12, 10)
+MATRIX = torch.tensor([[14.0, 0.0, 6.0], [0.0, 14.0, 5.0], [0.0, 0.0, 1.0]])
 
 
 def orbit_poses(count):
@@ -25,3 +28,12 @@ def orbit_images(count, size):
 def orbit_masks(count, size):
     """Masks that leave out a fifth of the pixels."""
     return np.random.default_rng(1).random((count, size[1], size[0])) > 0.2
+
+
+def orbit_cameras(count=6, **changed):
+    return nl.Cameras.from_opencv(orbit_poses(count), MATRIX, SIZE, **changed)
+
+
+def orbit_scene(cameras=None, **changed):
+    """Return six views; without a lens, if no cameras are given."""
+    return nl.Scene.from_cameras(orbit_images(6, SIZE), cameras or orbit_cameras(), name="orbit", **changed)
