@@ -57,22 +57,24 @@ class NerfLightning(Method):
 
     def __init__(self, *, checkpoint: Any = None, train_dataset: Any = None, config_overrides: Any = None):
         settings = {"max_steps": 20_000, **(config_overrides or {})}
-        self.info = INFO | {"num_iterations": int(settings.pop("max_steps")), "loaded_checkpoint": checkpoint}
+        length = int(settings.pop("max_steps"))
         file = None if checkpoint is None else Path(checkpoint) / FILE
         if train_dataset is None:
             self.run, self.model = None, nl.load(str(file))
         else:
             overrides = [f"{key}={value}" for key, value in settings.items()]
             self.run = nl.build_run(*overrides, scene=scene_of(train_dataset), resume=file)
-            self.model, self.steps = self.run.model, self.run.steps(self.info["num_iterations"])
-        self.info["loaded_step"] = None if file is None else self.model.checkpoint.step
+            self.model, self.steps = self.run.model, self.run.steps(length)
+        loaded = None if file is None else self.model.checkpoint.step
+        place = {"num_iterations": length, "loaded_checkpoint": checkpoint, "loaded_step": loaded}
+        self.info = INFO | place | {"hparams": settings}
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
         return INFO
 
     def get_info(self) -> dict[str, Any]:
-        return self.info | {"hparams": {}}
+        return self.info
 
     def train_iteration(self, step: int) -> dict[str, float]:
         return next(self.steps)

@@ -82,8 +82,8 @@ class StepwiseRun(Run):
             self.collapse_guard.look(step, batches, optimizer, seen, self.num_steps)
             if cause := self.nan_guard.cause(step):
                 raise InputError(f"{cause}, {STOPS} Begin anew, or from a checkpoint, with {CURE}.")
-            loss, error = float(seen.losses.sum()), seen.color_errors[-1]
-            yield {"step": self.num_steps, "loss": loss, "psnr": float(psnr(error)), "num_rays": batch.num_rays}
+            measured = {"loss": float(seen.losses.sum()), "psnr": float(psnr(seen.color_errors[-1]))}
+            yield {"step": self.num_steps, "num_rays": batch.num_rays} | measured
 
     @property
     def optimizer(self) -> Optimizer:
@@ -153,11 +153,8 @@ class StepwiseRun(Run):
         self.num_steps = content["global_step"]
 
     def _content(self) -> dict[str, Any]:
-        return {
-            "state_dict": self.system.state_dict(),
-            "global_step": self.num_steps,
-            KEY: self.system.kept_record(),
-        }
+        state, record = self.system.state_dict(), self.system.kept_record()
+        return {"state_dict": state, "global_step": self.num_steps, KEY: record}
 
 
 def build_run(
@@ -189,7 +186,7 @@ def build_run(
     config, choices = compose_config("train", overrides)
     set_limits(Budgets(**config.budgets))
     settings: TrainerSettings = build(config.trainer)
-    former = None if resume is None else read_checkpoint(resume, to_resume=True)
+    former = None if resume is None else read_checkpoint(Path(resume), to_resume=True)
     if former is not None:
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)

@@ -48,7 +48,7 @@ def run_state(step: TrainStep) -> dict[str, Any]:
 def loops_after(steps: int) -> dict[str, Any]:
     """Return what Lightning's loops keep in the midst of a run's one epoch, after so many steps."""
     no_trainer: Any = None
-    fit, predict = _FitLoop(no_trainer), _PredictionLoop(no_trainer)
+    fit: Any = _FitLoop(no_trainer)
     epoch, optimizer_steps = fit.epoch_loop, fit.epoch_loop.manual_optimization.optim_step_progress
     evaluation = epoch.val_loop.state_dict()
     epoch._batches_that_stepped = steps
@@ -58,7 +58,7 @@ def loops_after(steps: int) -> dict[str, Any]:
         batches.ready = batches.started = batches.processed = batches.completed = steps
     for taken in (optimizer_steps.total, optimizer_steps.current):
         taken.ready = taken.completed = steps
-    states = fit.state_dict(), evaluation, evaluation, predict.state_dict()
+    states = fit.state_dict(), evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
     return dict(zip(LOOPS, states, strict=True))
 
 

@@ -77,7 +77,8 @@ def scene_from_cameras(
             f"{SOURCE}: points have the shape (points, 3), and held_out numbers of the {count} images; these are "
             f"{sparse.shape} and {list(held_out)}."
         )
-    pixels = _store(images, cameras, masks)
+    sizes = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
+    pixels = _store(images, sizes, masks)
     views = tuple(_view(each, cameras[number]) for number, each in enumerate(names))
     capture = usable(Capture(views, Path(SOURCE), cameras.lens_model, torch.from_numpy(sparse)))
     if len(capture.views) < count:
@@ -85,7 +86,7 @@ def scene_from_cameras(
     held = tuple(sorted(set(held_out)))
     return scene_of(
         capture,
-        cameras_of(capture, [view.size for view in views], pixels, downscale=1),
+        cameras_of(capture, sizes, pixels, downscale=1),
         pixels,
         {"train": tuple(sorted({*range(count)} - {*held})), "val": held, "test": held},
         name=name,
@@ -103,9 +104,8 @@ def _view(name: str, camera: Cameras) -> View:
     return View(name, Photograph(Path(name)), camera.c2w.double().cpu(), focal, center, size, lens)
 
 
-def _store(images: Sequence[Any], cameras: Cameras, masks: Sequence[Any] | None) -> PixelStore:
-    """Return the pixels of the images, in one array."""
-    sizes = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
+def _store(images: Sequence[Any], sizes: Sequence[tuple[int, int]], masks: Sequence[Any] | None) -> PixelStore:
+    """Return the pixels of images of these sizes (width, height), in one array."""
     pixels, kept = empty_store(sizes), []
     for view, (width, height) in enumerate(sizes):
         rgba = _rgba(np.asarray(images[view]), view)
