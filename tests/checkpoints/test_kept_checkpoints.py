@@ -68,8 +68,7 @@ if __name__ == "__main__":
     folder = KEPT / nl.__version__
     folder.mkdir(parents=True, exist_ok=True)
     for kind, settings in KINDS.items():
-        sparse = ("data.sample_budget=null",) if kind == "fast" else ()
-        run = nl.build_run(*settings, *SMALL, *sparse, scene=scene_for(kind))
+        run = nl.build_run(*settings, *SMALL, scene=scene_for(kind))
         for _ in run.steps(3):
             pass
         run.save(folder / f"{kind}.ckpt")

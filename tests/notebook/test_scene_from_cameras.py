@@ -49,7 +49,7 @@ def test_images_are_bytes_or_shares_with_or_without_alpha_and_masks_keep_what_is
     [
         (5, {}, ("5 images", "as many cameras")),
         (6, {"masks": np.ones((6, 4, 4))}, ("image 0", "mask (4, 4)")),
-        (6, {"names": ["a"] * 6}, ("names", "same")),
+        (6, {"names": ["a"] * 6}, ("lists a more than once",)),
         (6, {"held_out": [6]}, ("held_out", "[6]")),
         (6, {"points": np.zeros((3, 2))}, ("points", "(3, 2)")),
         (6, {"background": "blue"}, ("blue",)),

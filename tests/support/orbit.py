@@ -34,6 +34,7 @@ def orbit_cameras(count=6, **changed):
     return nl.Cameras.from_opencv(orbit_poses(count), MATRIX, SIZE, **changed)
 
 
-def orbit_scene(cameras=None, **changed):
+def orbit_scene(cameras=None, space="bounded", **changed):
     """Return six views; without a lens, if no cameras are given."""
-    return nl.Scene.from_cameras(orbit_images(6, SIZE), cameras or orbit_cameras(), name="orbit", **changed)
+    given = orbit_cameras() if cameras is None else cameras
+    return nl.Scene.from_cameras(orbit_images(6, SIZE), given, name="orbit", space=space, **changed)

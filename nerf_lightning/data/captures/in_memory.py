@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import usable
+from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import cameras_of
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.pixels.decoding import Photograph
@@ -80,9 +81,10 @@ def scene_from_cameras(
     sizes = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
     pixels = _store(images, sizes, masks)
     views = tuple(_view(each, cameras[number]) for number, each in enumerate(names))
-    capture = usable(Capture(views, Path(SOURCE), cameras.lens_model, torch.from_numpy(sparse)))
+    left_out = LeftOut(SOURCE)
+    capture = usable(Capture(views, Path(SOURCE), cameras.lens_model, torch.from_numpy(sparse), left_out=left_out))
     if len(capture.views) < count:
-        raise InputError(next(iter(capture.left_out.faults.values()), f"{SOURCE}: two images have the same name."))
+        raise InputError(next(iter(left_out.faults.values()), f"{SOURCE}: two images have the same name."))
     held = tuple(sorted(set(held_out)))
     return scene_of(
         capture,
