@@ -53,7 +53,6 @@ def test_images_are_bytes_or_shares_with_or_without_alpha_and_masks_keep_what_is
         (6, {"held_out": [6]}, ("held_out", "[6]")),
         (6, {"points": np.zeros((3, 2))}, ("points", "(3, 2)")),
         (6, {"background": "blue"}, ("blue",)),
-        (6, {"space": "flat"}, ("flat", "contracted")),
         (6, {"near": 3.0, "far": 2.0}, ("near=3.0", "far=2.0")),
     ],
 )

@@ -47,10 +47,10 @@ class InMemoryReader(Reader):
 
 
 def scene_from_cameras(
-    images: Sequence[Any],
+    images: Any,
     cameras: Cameras,
     points: Any = None,
-    masks: Sequence[Any] | None = None,
+    masks: Any = None,
     background: str | None = None,
     *,
     names: Sequence[str] | None = None,
@@ -102,11 +102,11 @@ def scene_from_cameras(
 
 def _view(name: str, camera: Cameras) -> View:
     focal, center, lens = (tuple(numbers.tolist()) for numbers in (camera.focal, camera.center, camera.lens))
-    size = int(camera.width), int(camera.height)
+    size = float(camera.width), float(camera.height)
     return View(name, Photograph(Path(name)), camera.c2w.double().cpu(), focal, center, size, lens)
 
 
-def _store(images: Sequence[Any], sizes: Sequence[tuple[int, int]], masks: Sequence[Any] | None) -> PixelStore:
+def _store(images: Any, sizes: Sequence[tuple[int, int]], masks: Any) -> PixelStore:
     """Return the pixels of images of these sizes (width, height), in one array."""
     pixels, kept = empty_store(sizes), []
     for view, (width, height) in enumerate(sizes):

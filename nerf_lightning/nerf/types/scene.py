@@ -1,7 +1,6 @@
 """What a reader returns: cameras, pixels, and where the content lies."""
 
 import importlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -248,17 +247,17 @@ class Scene(SceneRecord):
     @classmethod
     def from_cameras(
         cls,
-        images: Sequence[Any],
+        images: Any,
         cameras: Cameras,
         points: Any = None,
-        masks: Sequence[Any] | None = None,
+        masks: Any = None,
         background: str | None = None,
         **settings: Any,
     ) -> "Scene":
         """Return a scene of images and cameras in memory; frame, extent and space follow from them as from a capture.
 
         Args:
-            images: arrays or tensors of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
+            images: a list, or one array or tensor, of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
                 sizes may differ.
             cameras: one per image, in the user's own frame and units (float64 where that is a map's).
             points: sparse points in that frame, (points, 3), which tell where the content lies; None: unknown.
