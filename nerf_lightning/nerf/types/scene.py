@@ -257,7 +257,7 @@ class Scene(SceneRecord):
         """Return a scene of images and cameras in memory; frame, extent and space follow from them as from a capture.
 
         Args:
-            images: a list, or one array or tensor, of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
+            images: a list or an array of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
                 sizes may differ.
             cameras: one per image, in the user's own frame and units (float64 where that is a map's).
             points: sparse points in that frame, (points, 3), which tell where the content lies; None: unknown.
