@@ -6,13 +6,10 @@ from typing import Any, ClassVar
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
-from torch.optim import Optimizer
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
-from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.step_output import StepOutput
 
 log = logging.getLogger(__name__)
@@ -64,9 +61,7 @@ class CollapseGuard(Callback):
         for writer in tensorboard_writers(trainer.loggers):
             writer.add_text("collapse_guard", message, trainer.global_step)
 
-    def look(
-        self, step: TrainStep, batches: RayBatches, optimizer: Optimizer, output: StepOutput, num_steps: int
-    ) -> str | None:
+    def look(self, step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
         """Look, where it is time, and restart a run that has collapsed.
 
         Args:
