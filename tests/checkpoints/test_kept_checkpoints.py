@@ -64,7 +64,7 @@ def test_there_is_one_of_each_kind_and_they_are_small():
     assert sum(file.stat().st_size for file in files) < 300_000
 
 
-if __name__ == "__main__":
+def remake():
     folder = KEPT / nl.__version__
     folder.mkdir(parents=True, exist_ok=True)
     for kind, settings in KINDS.items():
@@ -74,3 +74,7 @@ if __name__ == "__main__":
         run.save(folder / f"{kind}.ckpt")
     results = {kind: [round(mean, 5) for mean in rendered(folder / f"{kind}.ckpt")] for kind in KINDS}
     (folder / "rendered.json").write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    remake()
