@@ -17,7 +17,13 @@ from support.orbit import orbit_scene
 import nerf_lightning as nl
 
 KEPT = Path(__file__).parent / "kept"
-NERF = ("encoder.num_frequencies=3", "direction_encoder.num_frequencies=1", "field.width=8", "field.depth=2")
+NERF = (
+    "encoder.num_frequencies=3",
+    "direction_encoder.num_frequencies=1",
+    "field.width=8",
+    "field.depth=2",
+    "field.skip=1",
+)
 HASH = ("encoder.num_levels=2", "encoder.log2_table_size=5", "encoder.max_resolution=32", "field.width=8")
 GRID = ("model.levels.fine.sampler.resolution=8", "model.levels.fine.sampler.num_steps=16")
 PROPOSAL = "model.levels.proposal.field"
