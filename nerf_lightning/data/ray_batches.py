@@ -17,6 +17,7 @@ from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.kernels.backends import cuda_backend
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
@@ -89,6 +90,9 @@ class PixelDomain:
             number: of pixels, or of squares, for each of which all pixels are returned, in one row.
             shift: of the grid of squares, in pixels, below `patch`.
         """
+        kernels = cuda_backend("pixels.cuda", self.ends.device) if self.patch == 1 else None
+        if kernels is not None:
+            return PixelIndex(*kernels.locate(number, self.ends, self.width, self.views, self.left, self.top))
         slot = torch.searchsorted(self.ends, number, right=True)
         within = number - (self.ends[slot] - self.sizes[slot])
         row = torch.div(within, self.columns[slot], rounding_mode="floor")
@@ -111,11 +115,15 @@ class PixelDomain:
 
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
     """Return colours and weights of pixels."""
-    flat = scene.pixels.index_of(pixels.view, pixels.x, pixels.y)
-    mask = scene.pixels.mask
+    store, mask = scene.pixels, scene.pixels.mask
+    kernels = cuda_backend("pixels.cuda", store.rgba.device)
+    if kernels is not None:
+        shown = kernels.gather(pixels.view, pixels.x, pixels.y, store.offset, store.width, store.rgba, mask)
+        return Batch(pixels, *shown)
+    flat = store.index_of(pixels.view, pixels.x, pixels.y)
     return Batch(
         pixels=pixels,
-        rgba=scene.pixels.rgba[flat].to(torch.float32) / 255.0,
+        rgba=store.rgba[flat].to(torch.float32) / 255.0,
         weight=torch.ones(flat.shape, device=flat.device) if mask is None else mask[flat].to(torch.float32),
     )
 
@@ -217,7 +225,7 @@ class RayBatches:
         before = self._num_depths(position)
         num_depths = self._num_depths(position + count) - before
         position, count = position - before, count - num_depths
-        slots = slots[slots < count]
+        slots = range(min(slots.start, count), min(slots.stop, count))
         crop_squares = self.crop_rays(attempt - self.progress.rollbacks) // self.patch**2
         if position < crop_squares:
             domain, purpose = self.crop, "crop"
@@ -226,12 +234,14 @@ class RayBatches:
         if self.views is not None:
             key = fold(self.seed, attempt, purpose)
             starts, sizes = domain.ends.cpu() - domain.sizes.cpu(), domain.sizes.cpu()
-            numbers = rays_of_few_views(starts, sizes, position // count, slots, count, self.views, key)
+            mine = torch.arange(slots.start, slots.stop)
+            numbers = rays_of_few_views(starts, sizes, position // count, mine, count, self.views, key)
             return domain.locate(sent(numbers, domain.ends.device))
-        numbers, keys = self._in_order(position + slots, len(domain), attempt, purpose)
+        places = range(position + slots.start, position + slots.stop)
+        numbers, keys = self._in_order(places, len(domain), attempt, purpose)
         # Each epoch has its own grid of squares, so that no pixel always lies at a border.
-        shift, device = keys % self.patch, domain.ends.device
-        pixels = domain.locate(sent(numbers, device), sent(shift, device) if self.patch > 1 else 0)
+        device = domain.ends.device
+        pixels = domain.locate(sent(numbers, device), sent(keys % self.patch, device) if self.patch > 1 else 0)
         if self.depths is None:
             return pixels
         return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
@@ -242,25 +252,32 @@ class RayBatches:
         position, count, slots = self._squares_at(rays_seen, batch_rays)
         before = self._num_depths(position)
         first = count - (self._num_depths(position + count) - before)
-        numbers, _ = self._in_order(before + slots[slots >= first] - first, len(self.depths), attempt, "depths")
+        places = range(before + max(slots.start - first, 0), before + max(slots.stop - first, 0))
+        numbers, _ = self._in_order(places, len(self.depths), attempt, "depths")
         return sent(numbers, self.whole.ends.device)
 
-    def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, Int[Tensor, "squares"]]:
+    def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, range]:
         """Return how many squares came before, how many the batch has, and which of them are this process's."""
         count = (self.progress.batch_rays if batch_rays is None else batch_rays) // self.patch**2
-        return rays_seen // self.patch**2, count, torch.arange(count)[ranks.share(count)]
+        return rays_seen // self.patch**2, count, range(count)[ranks.share(count)]
 
     def _num_depths(self, squares: int) -> int:
         """Return how many of the first squares of a run have a pixel of known distance."""
         return 0 if self.depths is None else squares // self.depth_every
 
     def _in_order(
-        self, position: Int[Tensor, "squares"], size: int, attempt: int, purpose: str
-    ) -> tuple[Int[Tensor, "squares"], Int[Tensor, "squares"]]:
-        """Return what stands at each position, every number below `size` once an epoch, and the keys of the epochs."""
-        epochs, epoch = torch.unique_consecutive(position // size, return_inverse=True)
-        keys = torch.tensor([fold(self.seed, attempt, purpose, int(each)) for each in epochs], dtype=torch.int64)
-        return permute(position % size, size, keys if len(keys) == 1 else keys[epoch]), keys[epoch]
+        self, positions: range, size: int, attempt: int, purpose: str
+    ) -> tuple[Int[Tensor, "squares"], Int[Tensor, "*#squares"]]:
+        """Return what stands at each position, every number below `size` once an epoch, and the keys of the epochs.
+
+        There is one key where all positions lie in one epoch.
+        """
+        position = torch.arange(positions.start, positions.stop)
+        epochs = range(positions.start // size, max(positions.stop - 1, positions.start) // size + 1)
+        keys = torch.tensor([fold(self.seed, attempt, purpose, epoch) for epoch in epochs])
+        if len(epochs) > 1:
+            keys = keys[position // size - epochs.start]
+        return permute(position % size, size, keys), keys
 
 
 class FixedRays:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for, cpu_backend
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Word = TypeVar("Word", int, Tensor)
@@ -67,7 +67,7 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
-        kernels = cpu_backend("random.cpu", self.slots.device) if self.slots.dim() == 1 else None
+        kernels = backend_for("random", self.slots.device) if self.slots.dim() == 1 else None
         if kernels is not None:
             return kernels.uniform(self.key, self.slots, purpose_word(purpose), count)
         return self.along(count).uniform(purpose)
@@ -127,7 +127,7 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     columns = -(-size // rows)
     kernels = cpu_backend("random.cpu", index.device) if key.numel() == 1 and index.dim() == 1 else None
     if kernels is not None:
-        return kernels.permute(index, rows, columns, size, _round_words(key.view(())))
+        return kernels.permute(index, rows, columns, size, _round_words(int(key)))
     position = _feistel(index, rows, columns, key)
     while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
         position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
@@ -145,7 +145,6 @@ def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
     return row * columns + column
 
 
-def _round_words(key: Int[Tensor, "*n"]) -> Int[Tensor, "rounds *n"]:
+def _round_words(key: Word) -> list[Word]:
     # As many words as there are keys: a batch that lies in one epoch has one.
-    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
-    return mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)
+    return [mix((key + number * 0x1B873593) & WORD) for number in range(FEISTEL_ROUNDS)]

@@ -4,11 +4,11 @@ A step of a small model asks for hundreds of kernels that each take a few micros
 than the GPU to compute. A replayed graph asks once (https://pytorch.org/blog/accelerating-pytorch-with-cuda-graphs/).
 
 What is recorded is what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
-of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and a
-model that decides anything on the host between two steps is not recorded (`Model.replays`).
+of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and what
+a model decides on the host between two steps has recordings of its own (`Model.step_variant`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -55,12 +55,13 @@ class _Recording:
 
 
 class RecordedGradients:
-    """Compute the gradients of batches by replaying the first of their size.
+    """Compute the gradients of batches by replaying the first of their size and the model's variant.
 
     Args:
         compute: the work.
         parameters: all that learn.
         counts: returns the buffers that the work adds to, which are put back after it was tried.
+        variant: returns which of several sequences of kernels the model asks for in this step.
         record: makes a recording.
     """
 
@@ -69,16 +70,19 @@ class RecordedGradients:
         compute: Gradients,
         parameters: Sequence[Parameter],
         counts: Callable[[], Sequence[Tensor]],
+        variant: Callable[[], Hashable],
         record: Recorder = cuda_graph,
     ):
-        self.compute, self.parameters, self.counts, self.record = compute, parameters, counts, record
-        self.recordings: dict[int, _Recording] = {}
+        self.compute, self.parameters, self.counts = compute, parameters, counts
+        self.variant, self.record = variant, record
+        self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
     def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: Int[Tensor, ""]) -> StepOutput:
         """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones."""
-        if batch.num_rays not in self.recordings:
-            self.recordings[batch.num_rays] = self._recorded(batch, weight, key)
-        kept = self.recordings[batch.num_rays]
+        kind = batch.num_rays, self.variant()
+        if kind not in self.recordings:
+            self.recordings[kind] = self._recorded(batch, weight, key)
+        kept = self.recordings[kind]
         for inside, given in zip(kept.batch.tensors(), batch.tensors(), strict=True):
             inside.copy_(given)
         kept.weight.copy_(weight)

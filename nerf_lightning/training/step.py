@@ -24,7 +24,7 @@ from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.losses.mse import squared_error
+from nerf_lightning.nerf.losses.mse import MeanSquaredError, squared_error
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
@@ -162,21 +162,22 @@ class TrainStep:
         learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
         decides = ["refinement" if name == "rays" else name for name in learnt]
         decides += ["a penalty"] if any(part.penalty() is not None for part in self._parts()) else []
-        decides += ["loss"] if list(self.loss.buffers()) else []
+        decides += ["loss"] if self.loss.buffers_to_average() else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
         if not self.model.replays or decides:
             cause = f"and here are: {', '.join(decides)}" if decides else "and this model has others"
             raise InputError(
-                "trainer.cuda_graph=true replays the same kernels in each step: it is for models with an occupancy "
-                "grid (model=fast), without refinement, correction, model.subpixels, encoder.blend_in, and losses that "
-                f"learn, {cause}. Leave it out."
+                "trainer.cuda_graph=true replays the same kernels in each step: it is for models without refinement, "
+                f"correction, model.subpixels, encoder.blend_in, and losses that learn, {cause}. Leave it out."
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
             return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
 
-        self._recorded = RecordedGradients(compute, self._parameters(), self.model.sample_counts, record)
+        self._recorded = RecordedGradients(
+            compute, self._parameters(), self.model.sample_counts, lambda: self.model.step_variant, record
+        )
 
     @property
     def rays_together(self) -> int:
@@ -404,10 +405,16 @@ class TrainStep:
             terms = self.loss(shown, target[tile]) | _penalties(renderings)
             levels = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
             part = (tile.stop - tile.start) / share.num_rays
-            with torch.no_grad():
-                errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
-                terms = {name: values.detach() * part for name, values in terms.items()}
-            return TileLoss(levels * part, terms, errors * part, renderings[-1].foreground, shown[-1].rgb)
+            terms = {name: values.detach() for name, values in terms.items()}
+            if type(self.loss) is MeanSquaredError:
+                errors = terms["color"]  # the same
+            else:
+                with torch.no_grad():
+                    errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
+            if part < 1.0:
+                levels, errors = levels * part, errors * part
+                terms = {name: values * part for name, values in terms.items()}
+            return TileLoss(levels, terms, errors, renderings[-1].foreground, shown[-1].rgb)
 
         together = self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
@@ -418,12 +425,13 @@ class TrainStep:
             lost = parallel_backward(lose, parts, backward, self._parameters())
         else:
             lost = sequential_backward(lose, list(tiles(num_rays, threads * tile_rays, together)), backward)
+        of_batch = TileLoss.joined(lost)
         return StepOutput(
-            losses=torch.stack([each.levels for each in lost]).sum(0),
-            terms={name: torch.stack([each.terms[name] for each in lost]).sum(0) for name in lost[0].terms},
-            color_errors=torch.stack([each.errors for each in lost]).sum(0),
-            foreground=torch.cat([each.foreground for each in lost]),
-            rgb=torch.cat([each.rgb for each in lost]),
+            losses=of_batch.levels,
+            terms=of_batch.terms,
+            color_errors=of_batch.errors,
+            foreground=of_batch.foreground,
+            rgb=of_batch.rgb,
             target=target.rgb,
             weight=batch.weight,
             pixels=batch.pixels,

@@ -1,5 +1,6 @@
 """Steps whose gradients are not finite are left out, before they ruin the weights."""
 
+import math
 from collections.abc import Iterable
 
 import torch
@@ -25,19 +26,23 @@ class StepGuard:
         # Large tables are left out: what reaches them has passed through the MLPs, whose gradients show it too.
         gradients = {name: parameter.grad for name, parameter in parameters if parameter.grad is not None}
         watched = {name: gradient for name, gradient in gradients.items() if gradient.numel() < LARGE}
-        sums = [gradient.sum() for gradient in watched.values()]
-        broken = ~torch.isfinite(torch.stack([*sums, losses.sum()]))
-        bad, first_bad = broken.any(), broken.int().argmax()
-        if self.counts is None or self.counts.device != bad.device:
-            self.counts = torch.zeros(2, dtype=torch.long, device=bad.device)
-        begins = (self.counts[1] == 0) & bad
+        # Few operations, each of which is a launch on a GPU.
+        sums = torch._foreach_norm([*watched.values(), losses], ord=1)
+        finite, first_bad = (torch.stack(sums) < math.inf).int().min(dim=0)
+        if self.counts is None or self.counts.device != finite.device:
+            self.counts = torch.zeros(2, dtype=torch.long, device=finite.device)
+        bad = 1 - finite
+        self.counts = torch.stack([self.counts[0], self.counts[1] * bad]) + bad
+        begins = self.counts[1] == 1
         self.first_bad = first_bad if self.first_bad is None else torch.where(begins, first_bad, self.first_bad)
         self.watched = [*watched, "loss.itself"]
-        self.counts = torch.stack([self.counts[0] + bad, (self.counts[1] + 1) * bad])
-        if bad.device.type == "cpu":
-            return not bool(bad)
-        for gradient in gradients.values():
-            gradient.masked_fill_(bad, 0.0)
+        if finite.device.type == "cpu":
+            return bool(finite)
+        if finite.is_cuda:  # all at once: the bits times 1 or 0, since NaN times 0 is NaN
+            torch._foreach_mul_([gradient.view(torch.int32) for gradient in gradients.values()], finite)
+        else:
+            for gradient in gradients.values():
+                gradient.masked_fill_(bad.bool(), 0.0)
         return True
 
     @property

@@ -90,7 +90,9 @@ class RadianceFieldSystem(LightningModule):
         seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen.losses.sum()
         if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
-            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=True)
+            # What is on a bar is read in each step, for which the device is waited for.
+            on_bar = self.trainer.progress_bar_callback is not None
+            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=on_bar)
         return {"loss": loss, "step": seen}
 
     def monitors(self) -> list[Monitor]:

@@ -35,6 +35,19 @@ class TileLoss(TensorStruct):
     rgb: Float[Tensor, "rays 3"]
     """What was compared with the photographs."""
 
+    @classmethod
+    def joined(cls, tiles: Sequence["TileLoss"]) -> "TileLoss":
+        """Return what tiles add up to, their rays one after the other."""
+        if len(tiles) == 1:
+            return tiles[0]
+        return cls(
+            levels=torch.stack([each.levels for each in tiles]).sum(0),
+            terms={name: torch.stack([each.terms[name] for each in tiles]).sum(0) for name in tiles[0].terms},
+            errors=torch.stack([each.errors for each in tiles]).sum(0),
+            foreground=torch.cat([each.foreground for each in tiles]),
+            rgb=torch.cat([each.rgb for each in tiles]),
+        )
+
 
 def sequential_backward(
     lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward

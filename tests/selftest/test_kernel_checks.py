@@ -83,5 +83,5 @@ def test_a_kernel_that_does_not_compile_is_said_to_be_replaced(device, library, 
 
 def test_the_reference_does_not_go_through_what_it_checks(monkeypatch):
     """On the CPU the twins of march and ragged samples are numba's: the reference must be torch."""
-    monkeypatch.setattr(packed, "cpu_backend", lambda *given: None)
+    monkeypatch.setattr(packed, "backend_for", lambda *given: None)
     assert carried_out(CHECKS["ragged samples: value"]).outcome == "ok"

@@ -59,4 +59,4 @@ def static_system(name: str, scene, progress, num_steps: int, model=None, loss=N
         background=scene.background,
         clip_norm=1.0,
     )
-    return RadianceFieldSystem(step, {})
+    return RadianceFieldSystem(step, {"scene": {"splits": {"train": list(scene.splits["train"])}}})

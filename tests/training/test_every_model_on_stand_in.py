@@ -151,7 +151,7 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
     from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
     from nerf_lightning.nerf.kernels.mlp import cuda as mlp
 
-    kernels = {hash_grid: (NoKernel(6), NoKernel(0)), mlp: (NoKernel(2, 3), NoKernel(3, 4))}
+    kernels = {hash_grid: (NoKernel(6), NoKernel(0)), mlp: (NoKernel(4, 5), NoKernel(5, 6))}
     for module, (forward, backward) in kernels.items():
         monkeypatch.setattr(module, "_forward", forward)
         monkeypatch.setattr(module, "_backward", backward)

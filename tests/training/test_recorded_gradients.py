@@ -10,7 +10,7 @@ from support.tape import tape
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -18,7 +18,7 @@ from nerf_lightning.training.recorded_gradients import cuda_graph
 from nerf_lightning.training.step_output import StepOutput
 
 CPU = torch.device("cpu")
-KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "ragged.cpu", "random.cpu")
+KERNELS = CPU_BACKENDS
 SETTING = "trainer.cuda_graph=true"
 SMALL = ("encoder.num_levels=4", "encoder.log2_table_size=10", "model.levels.fine.sampler.update_every=4")
 
@@ -31,9 +31,9 @@ def as_on_a_gpu(monkeypatch):
         yield
 
 
-def trained(sizes, record):
+def trained(sizes, record, model="fast_small", *changes):
     """Take a step of each size, and return the run."""
-    run = step_by_step("fast_small", CPU, "32-true", None, *SMALL)
+    run = step_by_step(model, CPU, "32-true", None, *(changes or SMALL))
     run.training.model.set_returns_weights(True)  # so that no kernel takes whole rays
     if record:
         run.training.record_gradients(record=tape)
@@ -53,13 +53,13 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     sizes = [48] * 10
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert list(run.training._recorded.recordings) == [48]
+    assert list(run.training._recorded.recordings) == [(48, (None,))]
     assert run.training.model.statistics()["train/dropped_samples"] == 0
     assert run.all_losses().unique().numel() == 10
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert sorted(run.training._recorded.recordings) == [32, 48]
+    assert sorted(size for size, _ in run.training._recorded.recordings) == [32, 48]
 
 
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():
@@ -87,10 +87,22 @@ def test_what_the_host_decides_is_refused_by_name():
         run.training.record_gradients(record=tape)
 
 
-@pytest.mark.parametrize("model", ["fast_proposal", "nerf_tiny"])
-def test_models_without_an_occupancy_grid_and_other_devices_are_refused(model):
+PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.learn_always=2")
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "variants"),
+    [("nerf_tiny", ("data.batch_rays=48",), 1), ("fast_proposal", ("encoder.log2_table_size=10", *PROPOSALS), 2)],
+)
+def test_models_with_equally_many_samples_have_a_recording_for_each_variant_of_their_steps(model, changes, variants):
+    run = trained([48] * 8, True, model, *changes)
+    assert_same(run, trained([48] * 8, False, model, *changes))
+    assert len(run.training._recorded.recordings) == variants
+
+
+def test_models_that_read_on_the_host_and_other_devices_are_refused():
     with pytest.raises(InputError, match=rf"{SETTING}.*this model has others"):
-        step_by_step(model, CPU).training.record_gradients(record=tape)
+        step_by_step("view_transformer_tiny", CPU).training.record_gradients(record=tape)
     with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
         TrainerSettings(accelerator="cpu", cuda_graph=True)
 

@@ -50,9 +50,9 @@ class Planted(MeanSquaredError):
         super().__init__()
         self.fault = fault
 
-    def forward(self, renderings, target, weight):
+    def forward(self, renderings, target):
         self.fault(renderings[-1].opacity.detach())
-        return super().forward(renderings, target, weight)
+        return super().forward(renderings, target)
 
 
 FAULTS = {

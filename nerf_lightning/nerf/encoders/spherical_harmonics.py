@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
+from nerf_lightning.nerf.kernels.backends import cuda_backend
 
 # Normalised so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
 DEGREE_1 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -33,6 +34,10 @@ class SphericalHarmonicsEncoder(Encoder):
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
         """Return Y_00, Y_1-1, Y_10, Y_11, Y_2-2, ..."""
+        if points.dtype == torch.float32 and not points.requires_grad:
+            kernels = cuda_backend("spherical_harmonics.cuda", points.device)
+            if kernels is not None:
+                return kernels.spherical_harmonics(points.reshape(-1, 3), self.degree).view(*points.shape[:-1], -1)
         x, y, z = points.movedim(-1, 0).contiguous()
         columns = [torch.full_like(x, DEGREE_1)]
         if self.degree > 1:

@@ -80,6 +80,8 @@ class NGPField(Field):
         self.density_bias = density_bias
         self.least_slope = 0.0
         self.contracted = Contracted(contraction)
+        # Reading the buffer stops a GPU, so it is read once.
+        self._known_bias: float | None = None
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.density_mlp = _weights(position_encoder.out_dim, width, feature_dim)
@@ -109,6 +111,7 @@ class NGPField(Field):
         self.least_slope = 0.0 if scene.pixels.has_transparency else LEAST_SLOPE
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
+        self._known_bias = None
 
     def validate_state(self) -> None:
         """Look at what was loaded.
@@ -156,10 +159,12 @@ class NGPField(Field):
         grid, hooks = self.position_encoder.grid(), (*self._forward_hooks, *self._forward_pre_hooks)
         if grid is None or hooks or type(self) is not NGPField:  # a class of another name may compute something else
             return None
+        if self._known_bias is None:
+            self._known_bias = float(self.bias)
         return FieldParts(
             self.aabb,
             *grid,
-            float(self.bias),
+            self._known_bias,
             list(self.density_mlp),
             list(self.color_mlp),
             lambda rays: self._shared_along(Points(rays.origins, rays.view_directions, rays.photograph)),
@@ -199,6 +204,7 @@ class NGPField(Field):
         if codes is not None and trained is not None and codes.shape[1:] == (self.appearance,) and trained.ndim == 1:
             self.codes.data = self.codes.new_zeros(len(codes), self.appearance)
             self.trained = self.trained.new_zeros(len(trained))
+        self._known_bias = None
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _through(self, weights: nn.ParameterList, features: Tensor) -> Tensor:

@@ -26,7 +26,13 @@ CPU_BACKENDS = (
     *("render.cpu", "render.gradients", "render.dense"),
     *("random.cpu", "histograms.cpu", "lenses.cpu"),
 )
-"""The modules of this room that numba compiles."""
+"""The modules that numba compiles."""
+CUDA_BACKENDS = (
+    *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
+    *("render.cuda", "histograms.cuda", "adam.cuda", "pixels.cuda", "rays.cuda"),
+)
+"""The modules that triton compiles."""
+FP_FUSION = "TRITON_DEFAULT_FP_FUSION"
 LONG_SECONDS = 2.0
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
@@ -48,6 +54,8 @@ def backend(module: str) -> ModuleType | None:
     try:
         if library == "numba":
             _configure_numba()
+        else:  # products and sums in one rounding, which triton warns of where nobody has said so
+            os.environ.setdefault(FP_FUSION, "1")
         found = _imported(module)
         if library == "numba":
             _stamp_with_sources(found)
@@ -190,15 +198,20 @@ def is_on(module: str) -> bool:
 
 
 def cpu_backend(module: str, device: torch.device) -> ModuleType | None:
-    """Return a numba module of this room (`march.cpu`) for tensors on the CPU; else None."""
+    """Return a numba module (`march.cpu`) for tensors on the CPU; else None."""
     if device.type != "cpu" or not is_on(module):
         return None
     return backend(f"{KERNELS}.{module}")
 
 
 def cuda_backend(module: str, device: torch.device) -> ModuleType | None:
-    """Return a triton module of this room for tensors on a CUDA device; else None."""
+    """Return a triton module for tensors on a CUDA device; else None."""
     return backend(f"{KERNELS}.{module}") if device.type == "cuda" and is_on(module) else None
+
+
+def backend_for(kernel: str, device: torch.device) -> ModuleType | None:
+    """Return the numba or triton module of a kernel (`march`), whichever runs on the device; else None."""
+    return cpu_backend(f"{kernel}.cpu", device) or cuda_backend(f"{kernel}.cuda", device)
 
 
 def can_compile(device: torch.device) -> bool:

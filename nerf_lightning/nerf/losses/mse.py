@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.types.rays import Target
@@ -19,4 +20,4 @@ class MeanSquaredError(Loss):
 
 def squared_error(rgb: Float[Tensor, "rays 3"], target: Target) -> Float[Tensor, ""]:
     """Return the mean squared error of colours, weighted over rays, over rays and channels."""
-    return ((rgb - target.rgb).square() * target.weight[..., None]).mean()
+    return (mse_loss(rgb, target.rgb, reduction="none") * target.weight[..., None]).mean()

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
@@ -105,4 +105,4 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
 def _kernels_for(weights: Tensor) -> Any:
     # Everything else takes the plain way, which is the reference.
     suits = weights.dim() == 2 and weights.dtype == torch.float32
-    return cpu_backend("histograms.cpu", weights.device) if suits else None
+    return backend_for("histograms", weights.device) if suits else None

@@ -1,7 +1,7 @@
 """The contract of a model: what training, bench, exporters and the viewer ask of it, and no more."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import torch
@@ -34,8 +34,10 @@ class Model(nn.Module, ABC):
     """Mean PSNR (dB) of views that are shown by so many photographs, without the model, for each way to do so."""
 
     replays: bool = False
-    """True where a training step's kernels are the same in each step, so that a recording of them may be replayed: what
-    the host decides between two steps would stay as it was. Then `sample_counts` are all that a step changes."""
+    """True where a training step's kernels are the same in each step of one `step_variant`, so that a recording of them
+    may be replayed. Then `sample_counts` are all that a step changes."""
+    step_variant: Hashable = None
+    """What the host has decided for the next step, which changes what kernels it takes."""
 
     def __init__(self) -> None:
         super().__init__()

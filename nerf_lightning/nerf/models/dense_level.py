@@ -6,12 +6,12 @@ from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import has_dense_kernel, render_dense_rays
+from nerf_lightning.nerf.kernels.render.whole_rays import has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
-from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
+from nerf_lightning.nerf.rendering.quadrature import composite, dense_rendering, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -33,6 +33,7 @@ class DenseLevel(Level):
 
     sampler: DenseSampler
     sampler_kind = DenseSampler
+    replays = True
 
     def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
         super().__init__(sampler, field)
@@ -70,7 +71,10 @@ class DenseLevel(Level):
         whole_from = 0.0 if random is None else self.gradient_scaling_distance
         plain = rays.near.dim() != 1 or rays.near.dtype != torch.float32
         parts = None if plain else self._parts_on(rays.near.device)
-        if parts is not None:
+        integrated = render_samples(rays, samples, parts, self.field.matmul_precision, background is None, whole_from)
+        if integrated is not None:
+            return dense_rendering(integrated, samples, rays, background)
+        if parts is not None and rays.near.device.type == "cpu":
             weights, foreground = render_dense_rays(
                 rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from
             )
@@ -80,7 +84,7 @@ class DenseLevel(Level):
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether there is a kernel for the field; it has gradients of rays, too."""
-        return self._parts_on(device) is not None
+        return device.type == "cpu" and self._parts_on(device) is not None
 
     def field_parts(self) -> FieldParts | None:
         """Return what kernels of whole rays compute with; None where `field_output` is something else than the field's.
@@ -91,8 +95,11 @@ class DenseLevel(Level):
 
     def _parts_on(self, device: torch.device) -> FieldParts | None:
         """Return the field's parts where there is a kernel for them."""
-        parts = self.field_parts() if device.type == "cpu" else None  # elsewhere reading them would wait for the device
-        return parts if has_dense_kernel(parts, self.field.matmul_precision, device) else None
+        # Elsewhere reading them would wait for the device.
+        parts = self.field_parts() if device.type in ("cpu", "cuda") else None
+        if device.type == "cpu" and not has_dense_kernel(parts, self.field.matmul_precision, device):
+            return None
+        return parts
 
     def field_output(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""

@@ -1,6 +1,7 @@
 """The contract of a level: one round of sampling and rendering."""
 
 from abc import abstractmethod
+from collections.abc import Hashable
 from typing import Any
 
 import torch
@@ -40,6 +41,9 @@ class Level(nn.Module):
 
     replays: bool = False
     """True where a training step's kernels are the same in each step on a GPU (`Model.replays`)."""
+
+    step_variant: Hashable = None
+    """What the host has decided for the next step (`Model.step_variant`)."""
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()

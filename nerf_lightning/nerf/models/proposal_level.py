@@ -47,6 +47,11 @@ class ProposalLevel(DenseLevel):
         self.learn_every, self.learn_always = learn_every, learn_always
         self._learns = True
 
+    @property
+    def step_variant(self) -> bool:  # type: ignore[override]
+        """Whether it learns."""
+        return self._learns
+
     def update(self, step: int, key: int) -> None:
         """Decide whether the next step is one to learn in."""
         super().update(step, key)

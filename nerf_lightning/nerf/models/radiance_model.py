@@ -1,6 +1,6 @@
 """A method as named levels of (sampler, field): each level samples where the one before saw something."""
 
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -56,6 +56,11 @@ class RadianceModel(PointField):
     def replays(self) -> bool:  # type: ignore[override]
         """Whether every level does."""
         return all(level.replays for level in self._in_order())
+
+    @property
+    def step_variant(self) -> tuple[Any, ...]:  # type: ignore[override]
+        """Those of all levels."""
+        return tuple(level.step_variant for level in self._in_order())
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether every level does."""

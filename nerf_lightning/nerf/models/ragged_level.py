@@ -6,16 +6,24 @@ from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel, render_whole_rays
+from nerf_lightning.nerf.kernels.render.whole_rays import (
+    has_kernel,
+    render_samples,
+    render_whole_rays,
+    takes_samples,
+)
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.ragged import composite_ragged, ragged_rendering
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler, Sampler
 from nerf_lightning.nerf.samplers.early_termination import LEAST_ALPHA, render_until_opaque, visible_samples
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
+
+MOST_SAMPLES = 1 << 22
+"""That are rendered at once: their features take a gigabyte and a half."""
 
 
 class RaggedLevel(Level):
@@ -46,13 +54,35 @@ class RaggedLevel(Level):
         if whole is not None:
             return whole
         if evaluates:
-            return render_until_opaque(self.sampler, self.field, rays, background)
+            seen = self._all_samples_of(rays, background) if rays.near.is_cuda else None
+            return render_until_opaque(self.sampler, self.field, rays, background) if seen is None else seen
         samples, features = visible_samples(self.sampler, self.field, rays, random)
-        capacity = self.sampler.capacity_for(rays)
-        dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
-        self.counter.add(samples.found, rays.near.shape[0], torch.zeros_like(samples.found) + dropped)
+        capacity, found = self.sampler.capacity_for(rays), samples.found
+        dropped = torch.zeros_like(found) if capacity is None else (found - capacity).clamp(min=0)
+        self.counter.add(found, rays.near.shape[0], dropped)
+        fused = self._fused(rays, samples, background) if rays.near.is_cuda else None
+        if fused is not None:
+            return fused
         output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
         return composite_ragged(output, samples, rays, background)
+
+    def _all_samples_of(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering | None:
+        """Render rays with all their samples at once; None where there are too many, or no kernels.
+
+        A GPU is faster at samples that cannot be seen than at starting kernels for one chunk after the other.
+        """
+        if not takes_samples(rays, self.field.parts()):
+            return None
+        everyone = torch.arange(rays.near.shape[0], device=rays.near.device)
+        samples, _ = self.sampler.marcher(rays).advance(everyone, self.sampler.max_intervals)
+        return self._fused(rays, samples, background) if samples.starts.numel() <= MOST_SAMPLES else None
+
+    def _fused(
+        self, rays: RayBundle, samples: RaggedSamples, background: Float[Tensor, "rays 3"] | None
+    ) -> Rendering | None:
+        """Render samples with the kernels for CUDA; None where they do not do all that is asked for."""
+        integrated = render_samples(rays, samples, self.field.parts(), self.field.matmul_precision)
+        return None if integrated is None else ragged_rendering(integrated, samples, rays, background)
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether a kernel takes rays from end to end: in training without weights and gradients of rays."""

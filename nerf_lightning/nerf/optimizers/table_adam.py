@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.adam.step import adam_step
+from nerf_lightning.nerf.kernels.adam.step import adam_steps
 
 
 class TableAdam(Optimizer):
@@ -63,6 +63,7 @@ class TableAdam(Optimizer):
                 loss = closure()
         for group in self.param_groups:
             beta1, beta2 = group["betas"]
+            together: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {}
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
@@ -74,13 +75,13 @@ class TableAdam(Optimizer):
                 state["step"] += 1
                 if group["weight_decay"]:
                     parameter.grad.add_(parameter, alpha=group["weight_decay"])
-                adam_step(
-                    parameter,
-                    parameter.grad,
-                    state["exp_avg"],
-                    state["exp_avg_sq"],
-                    step_size=group["lr"] / (1.0 - beta1 ** state["step"]),
-                    root_scale=1.0 / math.sqrt(1.0 - beta2 ** state["step"]),
+                arrays = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+                together.setdefault(state["step"], []).append(arrays)
+            for step, rows in together.items():
+                adam_steps(
+                    rows,
+                    step_size=group["lr"] / (1.0 - beta1**step),
+                    root_scale=1.0 / math.sqrt(1.0 - beta2**step),
                     betas=(beta1, beta2),
                     eps=group["eps"],
                 )

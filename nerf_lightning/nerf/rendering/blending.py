@@ -32,9 +32,9 @@ def background_colors(
     """
     if background == "none":
         return None
-    shown = torch.full((num_rays, 3), 0.0 if at_evaluation(background) == "black" else 1.0, device=device)
+    shown = 0.0 if at_evaluation(background) == "black" else 1.0
     if background not in DRAWN or random is None:
-        return shown
+        return torch.full((num_rays, 3), shown, device=device)
     drawn = random.uniform("background", 3)
     if background == "random" or rgba is None:
         return drawn

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.kernels.search import search
 
 
@@ -34,7 +34,7 @@ def sample_histogram(
     """
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(f"{weights.shape[-1]} weights need {weights.shape[-1] + 1} edges, not {edges.shape[-1]}")
-    kernels = cpu_backend("histograms.cpu", u.device) if u.dim() == 2 and edges.dtype == torch.float32 else None
+    kernels = backend_for("histograms", u.device) if u.dim() == 2 and edges.dtype == torch.float32 else None
     if kernels is not None and not (edges.requires_grad or weights.requires_grad):
         return kernels.sample(edges, weights, u, floor, contracted)
     if contracted:

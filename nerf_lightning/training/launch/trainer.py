@@ -39,7 +39,7 @@ class TrainerSettings(ComputeSettings):
         num_threads: torch's threads on the CPU; None: one per core of ours.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves the time of asking for each;
-            for models with an occupancy grid. Not yet run on a GPU.
+            not for refinement, correction and losses that learn. Not yet run on a GPU.
         deterministic: refuse operations of GPUs whose sums depend on chance; the CPU's never do.
         devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
             TPU the cores, of one process.

@@ -1,5 +1,7 @@
 """Triton's kernels, compiled for GPUs that are not here: what they need fits, and what does not is left to torch."""
 
+import contextlib
+import importlib
 import logging
 import os
 import re
@@ -10,16 +12,31 @@ import pytest
 import torch
 from support.configs import composed, options
 from support.gpu_targets import DEVICES, OutOfResources, compiled_for
+from support.triton_kernels import forced
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
+from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
 from nerf_lightning.nerf.kernels.mlp import cuda as mlp
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp as any_mlp
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp_torch
+from nerf_lightning.nerf.kernels.ragged import cuda as ragged
 
 KERNELS = {mlp: ["_forward", "_backward"], hash_grid: ["_forward", "_backward"]}
+SMALL = {
+    "random.cuda": ["_uniform"],
+    "march.cuda": ["_enter", "_march"],
+    "spherical_harmonics.cuda": ["_harmonics"],
+    "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible"],
+    "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
+    "histograms.cuda": ["_sample", "_interlevel", "_distortion"],
+    "adam.cuda": ["_update"],
+    "pixels.cuda": ["_locate", "_gather"],
+    "rays.cuda": ["_rays"],
+}
+"""What `trial` of each other module launches."""
 BFLOAT16 = [name for name in DEVICES if name != "sm_75"]  # where float32 is used instead
 # The one that the kernels of the default model did not fit into is always tried.
 FOR_ALL = [pytest.param(name, marks=[] if name == "sm_89" else pytest.mark.minutes) for name in DEVICES]
@@ -67,6 +84,21 @@ def test_the_kernels_of_every_model_fit(name, reachable):
             assert mlp.takes(widths, torch.device("cpu")), widths
         assert len(made.kernels) == 2
         assert made.spilled() <= MOST_SPILLED, widths
+
+
+@pytest.mark.parametrize("name", FOR_ALL)
+def test_small_kernels_compile_and_keep_all_in_registers(name, monkeypatch):
+    assert set(backends.CUDA_BACKENDS) == {*SMALL, "mlp.cuda", "hash_grid.cuda"}
+    monkeypatch.setenv(backends.FP_FUSION, "1")
+    monkeypatch.setattr(torch, "empty", torch.ones)  # what no kernel writes, but the host reads
+    for module, names in SMALL.items():
+        kernels = importlib.import_module(f"{backends.KERNELS}.{module}")
+        launched = {ragged: SMALL["ragged.cuda"], kernels: names}  # quadrature ends the trial of rendering
+        # Nothing is computed, of which a trial complains, or torch that a number with gradients is read.
+        with compiled_for(name, launched) as made, forced(), contextlib.suppress(RuntimeError, UserWarning):
+            kernels.trial("cpu")
+        assert {kernel.metadata.name for kernel in made.kernels} >= set(names)
+        assert made.spilled() == 0, module
 
 
 @pytest.mark.minutes
@@ -130,10 +162,22 @@ from support.triton_perceptron import check_perceptron
 cuda.PROGRAMS = 2  # so that one takes several blocks
 check_perceptron("cpu", [0, 1, 640])
 """,
+    "batches": """
+import torch
+from support.triton_kernels import check_all
+check_all("cpu", torch.Generator().manual_seed(0), names=("adam.cuda", "pixels.cuda", "rays.cuda"))
+""",
+    "others": """
+import torch
+from support.triton_kernels import check_all
+check_all("cpu", torch.Generator().manual_seed(0))
+""",
 }
 
 
-@pytest.mark.parametrize("kernel", CHECKS)
+@pytest.mark.parametrize(
+    "kernel", [pytest.param(name, marks=[pytest.mark.minutes] * (name == "others")) for name in CHECKS]
+)
 def test_through_the_interpreter(kernel):
     pytest.importorskip("triton", reason="triton is not installed (Linux only)")
     # The interpreter is chosen when the kernels are defined: a process of its own.

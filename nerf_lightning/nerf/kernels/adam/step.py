@@ -1,10 +1,12 @@
 """One step of Adam on the entries whose gradient is not zero, which it sets to zero."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 
 
 def adam_step(
@@ -29,12 +31,27 @@ def adam_step(
         betas: b1, b2.
         eps: keeps the quotient finite.
     """
-    arrays = (parameter.detach(), grad, first, second)
-    backend = cpu_backend("adam.cpu", parameter.device)
-    if backend is not None and all(x.is_contiguous() and x.dtype == torch.float32 for x in arrays):
-        backend.adam_step(*arrays, step_size, root_scale, betas, eps)
-    else:
-        adam_step_torch(*arrays, step_size, root_scale, betas, eps)
+    adam_steps([(parameter, grad, first, second)], step_size, root_scale, betas, eps)
+
+
+def adam_steps(
+    parameters: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
+    step_size: float,
+    root_scale: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Do the same for several parameters of one device, each with its gradient and moments: on CUDA by one kernel."""
+    numbers, device = (step_size, root_scale, betas, eps), parameters[0][0].device
+    rows = [(row[0].detach(), *row[1:]) for row in parameters]
+    suits = [all(x.is_contiguous() and x.dtype == torch.float32 for x in row) for row in rows]
+    cuda = cuda_backend("adam.cuda", device) if all(suits) else None
+    if cuda is not None:
+        cuda.adam_steps(rows, *numbers)
+        return
+    cpu = cpu_backend("adam.cpu", device)
+    for row, suitable in zip(rows, suits, strict=True):
+        (cpu.adam_step if cpu is not None and suitable else adam_step_torch)(*row, *numbers)
 
 
 def adam_step_torch(

@@ -7,7 +7,7 @@ e[k] + jitter (e[k+1] - e[k]). Cascade c of the grid is the box, enlarged 2^c ti
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
@@ -34,6 +34,9 @@ def march(
     backend = cpu_backend("march.cpu", rays.near.device)
     if backend is not None and capacity is None:
         return backend.march(rays, state, lattice, grid, limit)
+    backend = cuda_backend("march.cuda", rays.near.device)
+    if backend is not None:
+        return backend.march(rays, state, lattice, grid, limit, capacity)
     from nerf_lightning.nerf.kernels.march.reference import march_torch
 
     return march_torch(rays, state, lattice, grid, limit, capacity)

@@ -15,7 +15,6 @@ import triton
 import triton.language as tl
 from jaxtyping import BFloat16, Float
 from torch import Tensor
-from torch.nn import functional
 from triton.runtime.errors import OutOfResources
 
 log = logging.getLogger(__name__)
@@ -30,6 +29,8 @@ PROGRAMS = 256
 """So many sum up the gradients of the weights, each for itself: the order of sums, and so their bits, are fixed."""
 NARROWEST, WIDEST = 16, 128
 LAYERS = (2, 3)
+INTERPRETED = triton.knobs.runtime.interpret
+"""Triton's interpreter multiplies no bfloat16 numbers."""
 
 
 @functools.cache
@@ -63,10 +64,9 @@ def forward(
     out = torch.empty(rows, weights[-1].shape[0], device=points.device)
     kept = out.new_empty(rows if keep else 0, sum(widths[:-1]), dtype=torch.bfloat16)
     if rows:
-        arrays = points.contiguous(), _packed(weights, widths), out, kept
-        sizes = points.shape[1], out.shape[1], *widths, widths[-1]
-        flags = len(weights), keep, BLOCK, _interpreted(out)
-        _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *sizes[:6], *flags, **FORWARD)
+        arrays = points.contiguous(), *_three(weights), out, kept
+        flags = len(weights), keep, BLOCK, INTERPRETED
+        _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *_sizes(weights, widths), *flags, **FORWARD)
     return out, kept
 
 
@@ -78,12 +78,13 @@ def backward(
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
     programs = max(1, min(PROGRAMS, triton.cdiv(rows, BACKWARD_BLOCK)))
-    sums = of_points.new_zeros(programs, sum(a * b for a, b in pairwise(widths)))
-    if rows:
-        arrays = grad.contiguous(), _packed(weights, widths), kept, of_points, sums
-        sizes = inputs, grad.shape[1], *widths, widths[-1]
-        flags = len(weights), wants_points, BACKWARD_BLOCK, _interpreted(sums)
-        _backward[(programs,)](*arrays, rows, *sizes[:6], *flags, **BACKWARD)
+    sums = of_points.new_empty(programs, sum(a * b for a, b in pairwise(widths)))
+    if not rows:
+        sums.zero_()
+    else:
+        arrays = grad.contiguous(), *_three(weights), kept, of_points, sums
+        flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
+        _backward[(programs,)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)
     total, grads, offset = sums.sum(dim=0), [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         of_weight = total[offset : offset + inner * outer].view(outer, inner)
@@ -116,18 +117,15 @@ def _padded_widths(weights: Sequence[Tensor]) -> list[int]:
     return [max(NARROWEST, triton.next_power_of_2(width)) for width in widths]
 
 
-def _packed(weights: Sequence[Tensor], widths: Sequence[int]) -> BFloat16[Tensor, "numbers"]:
-    """Return all layers' weights with zeros around them, row by row, one after the other."""
-    padded = [
-        functional.pad(weight, (0, inner - weight.shape[1], 0, outer - weight.shape[0])).flatten()
-        for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True)
-    ]
-    return torch.cat(padded).bfloat16()
+def _three(weights: Sequence[Tensor]) -> list[Tensor]:
+    """Return as many weights as the kernels take; they do not look at the last one of two."""
+    return [each.contiguous() for each in (*weights, weights[-1])[:3]]
 
 
-def _interpreted(tensor: Tensor) -> bool:
-    """Tell whether triton's interpreter runs, which multiplies no bfloat16 numbers."""
-    return not tensor.is_cuda
+def _sizes(weights: Sequence[Tensor], widths: Sequence[int]) -> tuple[int, ...]:
+    """Return the four widths of the layers as they are, and as they are padded; the last ones of two layers twice."""
+    given = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
+    return *(*given, given[-1])[:4], *(*widths, widths[-1])[:4]
 
 
 @triton.jit
@@ -140,8 +138,11 @@ def _multiply(left, right, widen: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _weights(packed, inner: tl.constexpr, outer: tl.constexpr):
-    return tl.load(packed + tl.arange(0, outer)[:, None] * inner + tl.arange(0, inner)[None, :])
+def _weights(weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr):
+    """Return a layer's weights in bfloat16, with zeros around them."""
+    row, column = tl.arange(0, outer)[:, None], tl.arange(0, inner)[None, :]
+    there = (row < n_out) & (column < n_in)
+    return tl.load(weight + row * n_in + column, mask=there, other=0.0).to(tl.bfloat16)
 
 
 @triton.jit
@@ -161,43 +162,49 @@ def _kept_at(kept, row, words: tl.constexpr, first: tl.constexpr, width: tl.cons
 
 @triton.jit
 @no_type_check
-def _activated(x, packed, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr):
-    sums = _multiply(x, tl.trans(_weights(packed, inner, outer)), widen)
+def _activated(
+    x, weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr
+):
+    sums = _multiply(x, tl.trans(_weights(weight, n_in, n_out, inner, outer)), widen)
     return tl.maximum(sums, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.bfloat16)
 
 
 @triton.jit
 @no_type_check
 def _forward(
-    points, packed, out, kept, count,
-    inputs: tl.constexpr, outputs: tl.constexpr, d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr,
-    d3: tl.constexpr, layers: tl.constexpr, keep: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
+    points, w0, w1, w2, out, kept, count,
+    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
+    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
+    layers: tl.constexpr, keep: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
 ):  # fmt: skip
     row = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
     valid = (row < count)[:, None]
     words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
-    x = _rows(points, row, count, inputs, d0)
-    y = _activated(x, packed, d0, d1, widen)
+    x = _rows(points, row, count, n0, d0)
+    y = _activated(x, w0, n0, n1, d0, d1, widen)
     if keep:
         tl.store(_kept_at(kept, row, words, 0, d0), x, mask=valid)
         tl.store(_kept_at(kept, row, words, d0, d1), y, mask=valid)
     if layers == 3:
-        z = _activated(y, packed + d0 * d1, d1, d2, widen)
+        z = _activated(y, w1, n1, n2, d1, d2, widen)
         if keep:
             tl.store(_kept_at(kept, row, words, d0 + d1, d2), z, mask=valid)
-        sums = _multiply(z, tl.trans(_weights(packed + d0 * d1 + d1 * d2, d2, d3)), widen)
+        sums = _multiply(z, tl.trans(_weights(w2, n2, n3, d2, d3)), widen)
         column = tl.arange(0, d3)
     else:
-        sums = _multiply(y, tl.trans(_weights(packed + d0 * d1, d1, d2)), widen)
+        sums = _multiply(y, tl.trans(_weights(w1, n1, n2, d1, d2)), widen)
         column = tl.arange(0, d2)
-    tl.store(out + row[:, None] * outputs + column[None, :], sums, mask=valid & (column < outputs)[None, :])
+    tl.store(out + row[:, None] * n3 + column[None, :], sums, mask=valid & (column < n3)[None, :])
 
 
 @triton.jit
 @no_type_check
-def _passed_back(flowing, x, packed, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr):
+def _passed_back(
+    flowing, x, weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr,
+    widen: tl.constexpr,
+):  # fmt: skip
     """Return the gradient of a layer's inputs x before their ReLU."""
-    sums = _multiply(flowing, _weights(packed, inner, outer), widen)
+    sums = _multiply(flowing, _weights(weight, n_in, n_out, inner, outer), widen)
     return tl.where(x.to(tl.float32) > 0.0, sums, 0.0).to(tl.bfloat16)
 
 
@@ -210,9 +217,10 @@ def _store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer:
 @triton.jit
 @no_type_check
 def _backward(
-    grad, packed, kept, of_points, sums, count,
-    inputs: tl.constexpr, outputs: tl.constexpr, d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr,
-    d3: tl.constexpr, layers: tl.constexpr, wants_points: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
+    grad, w0, w1, w2, kept, of_points, sums, count,
+    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
+    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
+    layers: tl.constexpr, wants_points: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
 ):  # fmt: skip
     words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
     of_0, of_1 = tl.zeros([d1, d0], tl.float32), tl.zeros([d2, d1], tl.float32)
@@ -221,22 +229,22 @@ def _backward(
         row = (start + tl.arange(0, block)).to(tl.int64)
         valid = (row < count)[:, None]
         if layers == 3:
-            flowing = _rows(grad, row, count, outputs, d3)
+            flowing = _rows(grad, row, count, n3, d3)
             z = tl.load(_kept_at(kept, row, words, d0 + d1, d2), mask=valid, other=0.0)
             of_2 += _multiply(tl.trans(flowing), z, widen)
-            flowing = _passed_back(flowing, z, packed + d0 * d1 + d1 * d2, d2, d3, widen)
+            flowing = _passed_back(flowing, z, w2, n2, n3, d2, d3, widen)
         else:
-            flowing = _rows(grad, row, count, outputs, d2)
+            flowing = _rows(grad, row, count, n3, d2)
         y = tl.load(_kept_at(kept, row, words, d0, d1), mask=valid, other=0.0)
         of_1 += _multiply(tl.trans(flowing), y, widen)
-        flowing = _passed_back(flowing, y, packed + d0 * d1, d1, d2, widen)
+        flowing = _passed_back(flowing, y, w1, n1, n2, d1, d2, widen)
         x = tl.load(_kept_at(kept, row, words, 0, d0), mask=valid, other=0.0)
         of_0 += _multiply(tl.trans(flowing), x, widen)
         if wants_points:
             column = tl.arange(0, d0)
-            there = valid & (column < inputs)[None, :]
-            into = of_points + row[:, None] * inputs + column[None, :]
-            tl.store(into, _multiply(flowing, _weights(packed, d0, d1), widen), mask=there)
+            there = valid & (column < n0)[None, :]
+            into = of_points + row[:, None] * n0 + column[None, :]
+            tl.store(into, _multiply(flowing, _weights(w0, n0, n1, d0, d1), widen), mask=there)
     own = sums + tl.program_id(0) * (d0 * d1 + d1 * d2 + (d2 * d3 if layers == 3 else 0))
     _store_sum(own, 0, of_0, d0, d1)
     _store_sum(own, d0 * d1, of_1, d1, d2)

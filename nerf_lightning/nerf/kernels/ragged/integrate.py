@@ -10,24 +10,51 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for, cuda_backend
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.types.rays import RaggedSamples
+
+Integrated = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "*samples"]]
+"""Per ray, sum of w rgb, sum of w, sum of w t; and the weights w."""
 
 
 def integrate(
     density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: RaggedSamples
-) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "capacity"]]:
+) -> Integrated:
     """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w."""
-    backend = cpu_backend("ragged.cpu", density.device)
+    backend = backend_for("ragged", density.device)
     if backend is None or density.dtype != torch.float32 or rgb.dtype != torch.float32:
         return integrate_torch(density, rgb, samples)
     return _Integrate.apply(density, rgb, samples.starts, samples.ends, samples.bounds, backend)
 
 
+def integrate_dense(
+    density: Float[Tensor, "*rays samples"],
+    rgb: Float[Tensor, "*rays samples 3"],
+    edges: Float[Tensor, "*rays edges"],
+    closed: bool,
+) -> Integrated | None:
+    """Return the same for rays with equally many samples; None where there is no kernel for it.
+
+    Args:
+        density: per unit length.
+        rgb: in [0, 1].
+        edges: fenceposts of the intervals.
+        closed: whether the last sample takes all the light that is left.
+    """
+    single = all(each.dtype == torch.float32 for each in (density, rgb, edges))
+    backend = cuda_backend("ragged.cuda", density.device) if single and not edges.requires_grad else None
+    if backend is None:
+        return None
+    shape, fenceposts = density.shape[:-1], edges.contiguous().flatten()
+    given = density.flatten(), rgb.flatten(0, -2), fenceposts, fenceposts[1:], fenceposts
+    foreground, opacity, depth, weights = _Integrate.apply(*given, backend, density.shape[-1], closed)
+    return foreground.view(*shape, 3), opacity.view(shape), depth.view(shape), weights.view_as(density)
+
+
 def num_visible(density: Float[Tensor, "capacity"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
-    backend = cpu_backend("ragged.cpu", density.device)
+    backend = backend_for("ragged", density.device)
     if backend is not None and density.dtype == torch.float32:
         return backend.num_visible(density, samples, opaque_below)
     counts = torch.zeros_like(samples.bounds[1:])
@@ -39,17 +66,26 @@ def num_visible(density: Float[Tensor, "capacity"], samples: RaggedSamples, opaq
 class _Integrate(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, density: Tensor, rgb: Tensor, starts: Tensor, ends: Tensor, bounds: Tensor, backend: Any
+        ctx: Any,
+        density: Tensor,
+        rgb: Tensor,
+        starts: Tensor,
+        ends: Tensor,
+        bounds: Tensor,
+        backend: Any,
+        *dense: int,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         density, rgb = density.contiguous(), rgb.contiguous()
-        foreground, opacity, depth, weights = backend.integrate(density, rgb, starts, ends, bounds)
+        foreground, opacity, depth, weights = backend.integrate(density, rgb, starts, ends, bounds, *dense)
         ctx.save_for_backward(density, rgb, starts, ends, bounds, weights)
-        ctx.backend = backend
+        ctx.backend, ctx.dense = backend, dense
         return foreground, opacity, depth, weights
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, foreground: Tensor, opacity: Tensor, depth: Tensor, weights: Tensor) -> tuple[Any, ...]:
         grads = (foreground, opacity, depth, weights)
-        density, rgb = ctx.backend.integrate_gradient(*ctx.saved_tensors, *(grad.contiguous() for grad in grads))
-        return density, rgb, None, None, None, None
+        density, rgb = ctx.backend.integrate_gradient(
+            *ctx.saved_tensors, *(grad.contiguous() for grad in grads), *ctx.dense
+        )
+        return density, rgb, *[None] * (len(ctx.needs_input_grad) - 2)

@@ -1,5 +1,6 @@
 """Random numbers and permutations for the CPU, bit for bit those of `nerf.randomness`."""
 
+from collections.abc import Sequence
 from typing import no_type_check
 
 import numpy as np
@@ -20,10 +21,10 @@ def uniform(
     return out
 
 
-def permute(index: Int[Tensor, "n"], rows: int, columns: int, size: int, words: Int[Tensor, "rounds"]) -> Tensor:
+def permute(index: Int[Tensor, "n"], rows: int, columns: int, size: int, words: Sequence[int]) -> Tensor:
     """Return where a permutation of range(size) sends each index, given the words of its rounds."""
     out = torch.empty_like(index)
-    _permute(0, len(index), index.contiguous().numpy(), rows, columns, size, words.numpy(), out.numpy())
+    _permute(0, len(index), index.contiguous().numpy(), rows, columns, size, np.array(words), out.numpy())
     return out
 
 
@@ -31,7 +32,7 @@ def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     one = torch.ones(1, dtype=torch.int64)
     uniform(one, one, 1, 1)
-    permute(one, 1, 2, 2, one)
+    permute(one, 1, 2, 2, [1])
 
 
 @njit

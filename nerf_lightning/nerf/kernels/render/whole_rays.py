@@ -1,6 +1,7 @@
 """Rays rendered from end to end in one kernel: the one front of these kernels, for any level that offers its rays.
 
-There are kernels for levels that march through an occupancy grid, and for those with equally many samples on every ray.
+On the CPU there are kernels for levels that march through an occupancy grid, and for those with equally many samples on
+every ray. On CUDA rays take several kernels, one after the other (`render_samples`).
 """
 
 from typing import Any, NamedTuple
@@ -9,13 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend, is_on
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
 from nerf_lightning.nerf.kernels.march.grid import GridMarch
+from nerf_lightning.nerf.kernels.ragged.integrate import Integrated
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 
-LEARNING, RENDERING, DENSE = "render.gradients", "render.cpu", "render.dense"
+LEARNING, RENDERING, DENSE, SAMPLES = "render.gradients", "render.cpu", "render.dense", "render.cuda"
 
 
 class WholeRays(NamedTuple):
@@ -52,6 +54,35 @@ def has_dense_kernel(field: FieldParts | None, matmul_precision: MatmulPrecision
     The arguments are those of `has_kernel`.
     """
     return field is not None and _has(DENSE, field, matmul_precision, device)
+
+
+def render_samples(
+    rays: RayBundle,
+    samples: RaggedSamples | RaySamples,
+    field: FieldParts | None,
+    matmul_precision: MatmulPrecision,
+    closed: bool = False,
+    whole_from: float = 0.0,
+) -> Integrated | None:
+    """Return what is seen along rays, by a few kernels on CUDA, which have gradients for the field's table and weights.
+
+    None where there are no such kernels, or other gradients are wanted. The other arguments are those of
+    `render_dense_rays`.
+    """
+    if field is None or not takes_samples(rays, field):
+        return None
+    kernels: Any = cuda_backend(SAMPLES, rays.near.device)
+    return kernels.render(rays, samples, field, matmul_precision, closed, whole_from)
+
+
+def takes_samples(rays: RayBundle, field: FieldParts | None) -> bool:
+    """Return whether `render_samples` renders samples on these rays."""
+    if field is None or field.ray_features_learn or rays.near.dim() != 1:
+        return False
+    numbers = (rays.origins, rays.directions, field.table, *field.density_weights, *field.color_weights)
+    if any(each.dtype != torch.float32 for each in numbers) or any(each.requires_grad for each in numbers[:2]):
+        return False
+    return cuda_backend(SAMPLES, rays.near.device) is not None
 
 
 def _has(module: str, field: FieldParts, matmul_precision: MatmulPrecision, device: torch.device) -> bool:

@@ -1,0 +1,176 @@
+"""Histograms along rays for CUDA: a program has a ray, and compares all of its bins at once.
+
+Letters as in `rendering.histograms` and `losses.proposal`. The results are the same in each run.
+`TRITON_INTERPRET=1` runs the kernels without a GPU.
+"""
+
+from typing import Any, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.contraction import TINY
+
+LANES = 32
+"""Samples that are looked for in all bins at a time."""
+BINS_OF_A_WARP = 64
+
+
+def sample(
+    edges: Float[Tensor, "rays edges"],
+    weights: Float[Tensor, "rays bins"],
+    u: Float[Tensor, "rays count"],
+    floor: float,
+    contracted: bool,
+) -> Float[Tensor, "rays count"]:
+    """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
+    out = torch.empty(u.shape, device=u.device)
+    if out.numel():
+        arrays = edges.contiguous(), weights.contiguous(), u.contiguous(), out
+        bins, count = weights.shape[1], u.shape[1]
+        block = triton.next_power_of_2(bins)
+        sizes = bins, count, contracted, block, LANES
+        _sample[(len(u),)](*arrays, floor, TINY, *sizes, num_warps=_warps(block))
+    return out
+
+
+def interlevel(
+    t: Float[Tensor, "rays edges"],
+    w: Float[Tensor, "rays samples"],
+    u: Float[Tensor, "rays outer"],
+    v: Float[Tensor, "rays bins"],
+) -> Float[Tensor, "rays"]:
+    """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
+    return _Loss.apply(_interlevel, (), v, t, w, u)
+
+
+def distortion(
+    edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"], contracted: bool
+) -> Float[Tensor, "rays"]:
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
+    return _Loss.apply(_distortion, (contracted,), w, edges)
+
+
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    edges, weights = torch.tensor([[0.0, 1.0, 2.0]], device=device), torch.ones(1, 2, device=device)
+    found = sample(edges, weights, torch.full((1, 1), 0.5, device=device), 0.01, False)
+    interlevel(edges, weights, edges, weights)
+    distortion(edges, weights, True)
+    if abs(float(found) - 1.0) > 1e-5:
+        raise RuntimeError("a trial of its kernels gave wrong numbers")
+
+
+class _Loss(torch.autograd.Function):
+    """A number per ray whose gradient for some weights is found with it."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: Any, flags: tuple[bool, ...], weights: Tensor, *given: Tensor) -> Tensor:
+        weights, given = weights.contiguous(), tuple(each.detach().contiguous() for each in given)
+        out, grad = weights.new_empty(len(weights)), torch.empty_like(weights)
+        bins, samples = weights.shape[1], (given[1] if len(given) > 1 else weights).shape[1]
+        if out.numel():
+            block = triton.next_power_of_2(bins)
+            sizes = bins, samples, *flags, block, LANES
+            kernel[(len(weights),)](weights, *given, out, grad, *sizes, num_warps=_warps(block))
+        ctx.save_for_backward(grad)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+        (own,) = ctx.saved_tensors
+        return None, None, own * grad[:, None], *[None] * (len(ctx.needs_input_grad) - 3)
+
+
+def _warps(block: int) -> int:
+    return min(8, max(1, block // BINS_OF_A_WARP))
+
+
+@triton.jit
+@no_type_check
+def _spaced(distance, contracted: tl.constexpr):
+    """In which even steps are even: `geometry.contraction.normalized_distance`."""
+    if contracted:
+        distance = tl.where(distance < 1.0, 0.5 * distance, 1.0 - 0.5 / tl.maximum(distance, 1.0))
+    return distance
+
+
+@triton.jit
+@no_type_check
+def _sample(
+    edges, weights, u, out, floor, tiny, bins, count, contracted: tl.constexpr, block: tl.constexpr, lanes: tl.constexpr
+):
+    ray, bin_index = tl.program_id(0).to(tl.int64), tl.arange(0, block)
+    there = bin_index < bins
+    mass = tl.where(there, tl.load(weights + ray * bins + bin_index, mask=there, other=0.0) + floor, 0.0)
+    share = mass / tl.sum(mass, axis=0)
+    above = tl.cumsum(share, axis=0)
+    below = above - share
+    left = _spaced(tl.load(edges + ray * (bins + 1) + bin_index, mask=there, other=0.0), contracted)
+    right = _spaced(tl.load(edges + ray * (bins + 1) + bin_index + 1, mask=there, other=0.0), contracted)
+    for start in range(0, count, lanes):
+        k = start + tl.arange(0, lanes)
+        wanted = tl.load(u + ray * count + k, mask=k < count, other=0.0)
+        # As many bins end at or before it; the last one holds what rounding leaves beyond its end.
+        number = tl.sum(((above[None, :] <= wanted[:, None]) & there[None, :]).to(tl.int32), axis=1)
+        mine = bin_index[None, :] == tl.minimum(number, bins - 1)[:, None]
+        first = tl.sum(tl.where(mine, below[None, :], 0.0), axis=1)
+        span = tl.sum(tl.where(mine, share[None, :], 0.0), axis=1)
+        low = tl.sum(tl.where(mine, left[None, :], 0.0), axis=1)
+        high = tl.sum(tl.where(mine, right[None, :], 0.0), axis=1)
+        part = tl.where(span > 0.0, (wanted - first) / tl.where(span > 0.0, span, 1.0), 0.5)
+        at = low + tl.minimum(tl.maximum(part, 0.0), 1.0) * (high - low)
+        if contracted:  # back again: `from_normalized_distance`
+            at = tl.where(at < 0.5, 2.0 * at, 0.5 / tl.maximum(1.0 - at, tiny))
+        tl.store(out + ray * count + k, at, mask=k < count)
+
+
+@triton.jit
+@no_type_check
+def _interlevel(v, t, w, u, out, grad, bins, samples, block: tl.constexpr, lanes: tl.constexpr):
+    ray, bin_index = tl.program_id(0).to(tl.int64), tl.arange(0, block)
+    there = bin_index < bins
+    inside = tl.load(v + ray * bins + bin_index, mask=there, other=0.0)
+    begin = tl.load(u + ray * (bins + 1) + bin_index, mask=there, other=float("inf"))
+    end = tl.load(u + ray * (bins + 1) + bin_index + 1, mask=there, other=float("-inf"))
+    loss, of_bins = 0.0, tl.zeros([block], tl.float32)
+    for start in range(0, samples, lanes):
+        i = start + tl.arange(0, lanes)
+        valid = i < samples
+        low = tl.load(t + ray * (samples + 1) + i, mask=valid, other=float("inf"))
+        high = tl.load(t + ray * (samples + 1) + i + 1, mask=valid, other=float("-inf"))
+        weight = tl.load(w + ray * samples + i, mask=valid, other=0.0)
+        touches = (begin[None, :] < high[:, None]) & (end[None, :] > low[:, None])
+        bound = tl.sum(tl.where(touches, inside[None, :], 0.0), axis=1)
+        excess = tl.maximum(weight - bound, 0.0)
+        share = excess / (weight + 1e-7)
+        loss += tl.sum(excess * share, axis=0)
+        of_bins -= tl.sum(tl.where(touches, 2.0 * share[:, None], 0.0), axis=0)
+    tl.store(out + ray, loss)
+    tl.store(grad + ray * bins + bin_index, of_bins, mask=there)
+
+
+@triton.jit
+@no_type_check
+def _distortion(w, edges, out, grad, bins, samples, contracted: tl.constexpr, block: tl.constexpr, lanes: tl.constexpr):
+    ray, i = tl.program_id(0).to(tl.int64), tl.arange(0, block)
+    there = i < bins
+    weight = tl.load(w + ray * bins + i, mask=there, other=0.0)
+    row = edges + ray * (bins + 1)
+    first, last = _spaced(tl.load(row), contracted), _spaced(tl.load(row + bins), contracted)
+    span = tl.maximum(last - first, 1e-6)
+    begin = _spaced(tl.load(row + i, mask=there, other=0.0), contracted)
+    end = _spaced(tl.load(row + i + 1, mask=there, other=0.0), contracted)
+    m, length = (0.5 * (begin + end) - first) / span, (end - begin) / span
+    # Sums over the samples before and behind each.
+    moment = weight * m
+    before, behind = tl.cumsum(weight, axis=0) - weight, tl.cumsum(weight, axis=0, reverse=True) - weight
+    nearer = m * before - (tl.cumsum(moment, axis=0) - moment)
+    farther = tl.cumsum(moment, axis=0, reverse=True) - moment - m * behind
+    pairs, own = weight * nearer, weight * weight * length
+    tl.store(out + ray, 2.0 * tl.sum(tl.where(there, pairs, 0.0), axis=0) + tl.sum(own, axis=0) / 3.0)
+    tl.store(grad + ray * bins + i, 2.0 * (nearer + farther) + weight * length * (2.0 / 3.0), mask=there)

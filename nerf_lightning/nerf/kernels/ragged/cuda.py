@@ -1,0 +1,234 @@
+"""Volume rendering for CUDA: a program sums along a ray, 32 samples at a time.
+
+Where all rays have equally many samples, `starts` and `ends` are views of their fenceposts, and there are no bounds.
+Letters as in `kernels.ragged.integrate`. Sums along a ray have a fixed order, so the results are the same in each run.
+`TRITON_INTERPRET=1` runs the kernels without a GPU.
+"""
+
+from typing import no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+from nerf_lightning.nerf.types.rays import RaggedSamples
+
+BLOCK = 32
+
+
+def integrate(
+    density: Float[Tensor, "n"],
+    rgb: Float[Tensor, "n 3"],
+    starts: Float[Tensor, "starts"],
+    ends: Float[Tensor, "ends"],
+    bounds: Shaped[Tensor, "bounds"],
+    each: int = 0,
+    closed: bool = False,
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "n"]]:
+    """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w.
+
+    Args:
+        density: per unit length.
+        rgb: in [0, 1].
+        starts: where each interval begins; of rays with as many samples each, all fenceposts.
+        ends: where it ends; the same from the second on.
+        bounds: the samples of ray r are those from bounds[r] to bounds[r + 1].
+        each: samples of every ray, where there are no bounds; 0: as the bounds say.
+        closed: whether the last sample of a ray takes all the light that is left.
+    """
+    capacity = density.shape[0]
+    rays = capacity // each if each else bounds.shape[0] - 1
+    foreground, weights = density.new_empty(rays, 3), torch.empty_like(density)
+    opacity, depth = density.new_empty(rays), density.new_empty(rays)
+    if rays:
+        arrays = density, rgb, starts, ends, bounds, foreground, opacity, depth, weights
+        _integrate[(rays,)](*arrays, capacity, rays, each, closed, BLOCK, num_warps=1)
+    return foreground, opacity, depth, weights
+
+
+def integrate_gradient(
+    density: Float[Tensor, "n"],
+    rgb: Float[Tensor, "n 3"],
+    starts: Float[Tensor, "starts"],
+    ends: Float[Tensor, "ends"],
+    bounds: Shaped[Tensor, "bounds"],
+    weights: Float[Tensor, "n"],
+    of_foreground: Float[Tensor, "rays 3"],
+    of_opacity: Float[Tensor, "rays"],
+    of_depth: Float[Tensor, "rays"],
+    of_weights: Float[Tensor, "n"],
+    each: int = 0,
+    closed: bool = False,
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """Return the gradients of density and colour, given those of the four results."""
+    of_density, of_rgb = torch.empty_like(density), torch.empty_like(rgb)
+    capacity = density.shape[0]
+    rays = capacity // each if each else bounds.shape[0] - 1
+    if rays:
+        arrays = density, rgb, starts, ends, bounds, weights, of_foreground, of_opacity, of_depth, of_weights
+        _integrate_back[(rays,)](*arrays, of_density, of_rgb, capacity, rays, each, closed, BLOCK, num_warps=1)
+    return of_density, of_rgb
+
+
+def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
+    """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
+    counts = torch.empty_like(samples.bounds[1:])
+    if counts.numel():
+        arrays = density.contiguous(), samples.starts, samples.ends, samples.bounds, counts
+        _num_visible[(counts.numel(),)](*arrays, opaque_below, BLOCK, num_warps=1)
+    return counts
+
+
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    one, bounds = torch.ones(2, device=device), torch.tensor([0, 1, 2], device=device)
+    given = one, torch.ones(2, 3, device=device), 0 * one, one, bounds
+    foreground, opacity, depth, weights = integrate(*given)
+    integrate_gradient(*given, weights, foreground, opacity, depth, weights)
+    num_visible(one, RaggedSamples(bounds[:2], 0 * one, one, bounds, bounds[-1]), 0.5)
+    if abs(float(opacity[1]) - 0.6321206) > 1e-5:
+        raise RuntimeError("a trial of its kernels gave wrong numbers")
+
+
+@triton.jit
+@no_type_check
+def _alpha(optical):
+    """Return 1 - exp(-x), by its series where that would lose all digits."""
+    series = optical * (1.0 - optical * (0.5 - optical * (1.0 / 6.0 - optical * (1.0 / 24.0))))
+    return tl.where(optical < 0.03, series, 1.0 - tl.exp(-optical))
+
+
+@triton.jit
+@no_type_check
+def _samples_of(bounds, ray, each):
+    """Return the first sample of a ray, the one after its last, and by how much its intervals' numbers are higher."""
+    if each > 0:
+        first = ray.to(tl.int64) * each
+        last = first + each
+        shift = ray
+    else:
+        first = tl.load(bounds + ray)
+        last = tl.load(bounds + ray + 1)
+        shift = ray * 0
+    return first, last, shift
+
+
+@triton.jit
+@no_type_check
+def _optical(density, starts, ends, sample, valid):
+    """Return density times length of some samples, and where their middles are."""
+    begin, end = tl.load(starts + sample, mask=valid, other=0.0), tl.load(ends + sample, mask=valid, other=0.0)
+    return tl.load(density + sample, mask=valid, other=0.0) * (end - begin), 0.5 * (begin + end)
+
+
+@triton.jit
+@no_type_check
+def _light(before, density, starts, ends, sample, first, valid):
+    """Return the light that reaches some samples in a row, given the optical depth before them.
+
+    The sum is of the samples before each: a difference would lose what lies in front of a dense one.
+    """
+    nearer, _ = _optical(density, starts, ends, sample - 1, valid & (sample > first))
+    return tl.exp(-(before + tl.cumsum(nearer, axis=0)))
+
+
+@triton.jit
+@no_type_check
+def _integrate(
+    density, rgb, starts, ends, bounds, foreground, opacity, depth, weights, capacity, rays, each: tl.constexpr,
+    closed: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    ray, lane = tl.program_id(0), tl.arange(0, block)
+    first, last, shift = _samples_of(bounds, ray, each)
+    starts, ends = starts + shift, ends + shift
+    before, reds, greens, blues, total, far = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for start in range(first, last, block):
+        sample = start + lane
+        valid = sample < last
+        optical, t = _optical(density, starts, ends, sample, valid)
+        alpha = _alpha(optical)
+        if closed:
+            alpha = tl.where(sample == last - 1, 1.0, alpha)
+        w = _light(before, density, starts, ends, sample, start, valid) * alpha
+        before += tl.sum(optical, axis=0)
+        tl.store(weights + sample, w, mask=valid)
+        reds += tl.sum(w * tl.load(rgb + 3 * sample, mask=valid, other=0.0), axis=0)
+        greens += tl.sum(w * tl.load(rgb + 3 * sample + 1, mask=valid, other=0.0), axis=0)
+        blues += tl.sum(w * tl.load(rgb + 3 * sample + 2, mask=valid, other=0.0), axis=0)
+        total += tl.sum(w, axis=0)
+        far += tl.sum(w * t, axis=0)
+    tl.store(foreground + 3 * ray, reds)
+    tl.store(foreground + 3 * ray + 1, greens)
+    tl.store(foreground + 3 * ray + 2, blues)
+    tl.store(opacity + ray, total)
+    tl.store(depth + ray, far)
+    used = capacity if each > 0 else tl.load(bounds + rays)
+    for start in range(used + ray * block, capacity, rays * block):  # padding
+        tl.store(weights + start + lane, tl.zeros([block], tl.float32), mask=start + lane < capacity)
+
+
+@triton.jit
+@no_type_check
+def _integrate_back(
+    density, rgb, starts, ends, bounds, weights, of_foreground, of_opacity, of_depth, of_weights, of_density, of_rgb,
+    capacity, rays, each: tl.constexpr, closed: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    ray, lane = tl.program_id(0), tl.arange(0, block)
+    first, last, shift = _samples_of(bounds, ray, each)
+    starts, ends = starts + shift, ends + shift
+    of_red, of_green = tl.load(of_foreground + 3 * ray), tl.load(of_foreground + 3 * ray + 1)
+    of_blue = tl.load(of_foreground + 3 * ray + 2)
+    toward_opacity, toward_depth = tl.load(of_opacity + ray), tl.load(of_depth + ray)
+    before = 0.0
+    for start in range(first, last, block):
+        sample = start + lane
+        optical, _ = _optical(density, starts, ends, sample, sample < last)
+        # Kept for the way back: the light behind each sample.
+        tl.store(of_density + sample, tl.exp(-(before + tl.cumsum(optical, axis=0))), mask=sample < last)
+        before += tl.sum(optical, axis=0)
+    tl.debug_barrier()
+    behind = 0.0
+    for chunk in range((last - first + block - 1) // block):
+        sample = first + ((last - first + block - 1) // block - 1 - chunk) * block + lane
+        valid = sample < last
+        begin, end = tl.load(starts + sample, mask=valid, other=0.0), tl.load(ends + sample, mask=valid, other=0.0)
+        light_after = tl.load(of_density + sample, mask=valid, other=0.0)
+        if closed:
+            light_after = tl.where(sample == last - 1, 0.0, light_after)
+        w = tl.load(weights + sample, mask=valid, other=0.0)
+        red = tl.load(rgb + 3 * sample, mask=valid, other=0.0)
+        green = tl.load(rgb + 3 * sample + 1, mask=valid, other=0.0)
+        blue = tl.load(rgb + 3 * sample + 2, mask=valid, other=0.0)
+        g = of_red * red + of_green * green + of_blue * blue + toward_opacity + toward_depth * 0.5 * (begin + end)
+        g += tl.load(of_weights + sample, mask=valid, other=0.0)
+        wg = w * g
+        later = behind + tl.cumsum(wg, axis=0, reverse=True) - wg
+        behind += tl.sum(wg, axis=0)
+        tl.store(of_density + sample, (end - begin) * (light_after * g - later), mask=valid)
+        tl.store(of_rgb + 3 * sample, w * of_red, mask=valid)
+        tl.store(of_rgb + 3 * sample + 1, w * of_green, mask=valid)
+        tl.store(of_rgb + 3 * sample + 2, w * of_blue, mask=valid)
+    nothing = tl.zeros([block], tl.float32)
+    used = capacity if each > 0 else tl.load(bounds + rays)
+    for start in range(used + ray * block, capacity, rays * block):  # padding
+        sample = start + lane
+        tl.store(of_density + sample, nothing, mask=sample < capacity)
+        for channel in tl.static_range(3):
+            tl.store(of_rgb + 3 * sample + channel, nothing, mask=sample < capacity)
+
+
+@triton.jit
+@no_type_check
+def _num_visible(density, starts, ends, bounds, counts, opaque_below, block: tl.constexpr):
+    ray, lane = tl.program_id(0), tl.arange(0, block)
+    first, last = tl.load(bounds + ray), tl.load(bounds + ray + 1)
+    before, seen = 0.0, tl.zeros([], tl.int64)
+    for start in range(first, last, block):
+        valid = start + lane < last
+        light = _light(before, density, starts, ends, start + lane, start, valid)
+        optical, _ = _optical(density, starts, ends, start + lane, valid)
+        before += tl.sum(optical, axis=0)
+        seen += tl.sum((valid & (light > opaque_below)).to(tl.int64), axis=0)
+    tl.store(counts + ray, seen)

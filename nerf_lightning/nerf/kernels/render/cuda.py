@@ -1,0 +1,287 @@
+"""Samples to pixels on CUDA: what lies between the large kernels, in one pass each.
+
+The hash grid, the perceptrons and the quadrature have kernels of their own; from rays to their points, from hidden
+features to the inputs of the colour, and from raw numbers to density and colour are functions of single samples, which
+plain torch would compute in dozens of passes. `TRITON_INTERPRET=1` runs the kernels without a GPU. The results are the
+same in each run, but for the gradient of the hash grid, which is summed up atomically.
+"""
+
+from typing import Any, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
+from nerf_lightning.nerf.kernels.mlp.mlp import mlp
+from nerf_lightning.nerf.kernels.ragged.integrate import Integrated, integrate, integrate_dense
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
+
+BLOCK = 256
+
+
+def render(
+    rays: RayBundle,
+    samples: RaggedSamples | RaySamples,
+    field: FieldParts,
+    matmul_precision: MatmulPrecision,
+    closed: bool,
+    whole_from: float,
+) -> Integrated:
+    """Return what is seen along rays, with gradients for the field's table and weights.
+
+    Args:
+        rays: unit directions, scene units; one axis.
+        samples: where along them.
+        field: table and weights; where it has none of colour, all is black.
+        matmul_precision: of the perceptrons' products.
+        closed: whether the last sample of a ray takes all the light that is left.
+        whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
+    """
+    where = _Where(rays, samples)
+    points = _points(rays, where, field)
+    hidden = mlp(interpolate(field.table, points, field.layout), field.density_weights, matmul_precision)
+    raw = hidden.new_empty(0, 3)
+    if field.color_weights:
+        raw = mlp(_Joined.apply(hidden, field.ray_features(rays), where), field.color_weights, matmul_precision)
+    density, rgb = _Activated.apply(hidden, raw, points, where, field, whole_from)
+    if isinstance(samples, RaggedSamples):
+        return integrate(density, rgb, samples)
+    shape = rays.near.shape[0], where.each
+    found = integrate_dense(density.view(shape), rgb.view(*shape, 3), samples.edges, closed)
+    assert found is not None
+    return found
+
+
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+
+    one, along = torch.ones(2, device=device), torch.tensor([[0.0, 0.0, 1.0]] * 2, device=device)
+    rays, layout = RayBundle(-2 * along, along, one, 3 * one, along), hash_grid_layout(2, 6, 2, 8)
+    table = torch.ones(layout.offsets[-1], 2, device=device, requires_grad=True)
+    weights = [torch.ones(16, 4, device=device, requires_grad=True), torch.ones(3, 19, device=device)]
+    aabb = torch.tensor([[-1.0] * 3, [1.0] * 3], device=device)
+    field = FieldParts(aabb, table, layout, 0.0, weights[:1], weights[1:], lambda rays: rays.view_directions)
+    samples = RaySamples(torch.tensor([[1.0, 2.0, 3.0]] * 2, device=device))
+    with torch.enable_grad():
+        foreground, opacity, _, _ = render(rays, samples, field, "float32", False, 1.0)
+        (foreground.sum() + opacity.sum()).backward()
+    if table.grad is None or not bool(table.grad.isfinite().all()) or float(opacity[0]) < 0.9:
+        raise RuntimeError("a trial of its kernels gave wrong numbers")
+
+
+class _Where:
+    """Where samples are: of which ray, and between which distances."""
+
+    def __init__(self, rays: RayBundle, samples: RaggedSamples | RaySamples):
+        self.starts = samples.starts if isinstance(samples, RaggedSamples) else samples.edges.contiguous()
+        self.ends = samples.ends if isinstance(samples, RaggedSamples) else self.starts.view(-1)[1:]
+        self.ray_index = samples.ray_index if isinstance(samples, RaggedSamples) else self.starts
+        self.each = 0 if isinstance(samples, RaggedSamples) else samples.edges.shape[-1] - 1
+        """Samples of every ray; 0: as the index says."""
+        self.count = self.starts.shape[0] if self.each == 0 else rays.near.shape[0] * self.each
+
+    @property
+    def arrays(self) -> tuple[Tensor, Tensor, Tensor]:
+        """For the kernels."""
+        return self.ray_index, self.starts, self.ends
+
+    @property
+    def programs(self) -> tuple[int]:
+        """That take a block of samples each."""
+        return (triton.cdiv(self.count, BLOCK),)
+
+
+def _points(rays: RayBundle, where: _Where, field: FieldParts) -> Float[Tensor, "samples 3"]:
+    """Return the samples' midpoints in the unit cube (`NGPField._unit`); without gradients."""
+    out = torch.empty(where.count, 3, device=rays.near.device)
+    if where.count:
+        arrays = rays.origins.detach().contiguous(), rays.directions.detach().contiguous(), field.aabb, *where.arrays
+        _locate[where.programs](*arrays, out, where.count, where.each, field.contracted, BLOCK)
+    return out
+
+
+class _Joined(torch.autograd.Function):
+    """The inputs of the colours: each sample's hidden features, and what its ray's samples share."""
+
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, shared: Tensor, where: _Where) -> Tensor:
+        ctx.width, widths = hidden.shape[1], (hidden.shape[1], shared.shape[1])
+        out = hidden.new_empty(where.count, sum(widths))
+        if where.count:
+            width = triton.next_power_of_2(sum(widths))
+            arrays = hidden.contiguous(), shared.contiguous(), where.ray_index, out
+            programs = (triton.cdiv(where.count * width, 8 * BLOCK),)
+            _join[programs](*arrays, where.count, *widths, where.each, width, 8 * BLOCK // width)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return grad[:, : ctx.width], None, None
+
+
+class _Activated(torch.autograd.Function):
+    """Density and colour of raw numbers (`nerf.activations`); outside of its box a field has no density."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, hidden: Tensor, raw: Tensor, points: Tensor, where: _Where, field: FieldParts, whole_from: float
+    ) -> tuple[Tensor, Tensor]:
+        count, colored = where.count, bool(field.color_weights)
+        hidden, raw = hidden.contiguous(), raw.contiguous()
+        density, rgb = hidden.new_empty(count), hidden.new_empty(count, 3)
+        if count:
+            flags = hidden.shape[1], not field.contracted, colored, BLOCK
+            _activate[where.programs](hidden, raw, points, density, rgb, field.bias, LARGEST_RAW, count, *flags)
+        ctx.save_for_backward(hidden, points, rgb)
+        ctx.where, ctx.field, ctx.whole_from = where, field, whole_from
+        return density, rgb
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, points, rgb = ctx.saved_tensors
+        where, field = ctx.where, ctx.field
+        colored = bool(field.color_weights)
+        of_hidden, of_raw = torch.empty_like(hidden), torch.empty_like(rgb) if colored else rgb
+        if where.count:
+            arrays = hidden, points, rgb, of_density.contiguous(), of_rgb.contiguous(), *where.arrays[1:]
+            numbers = field.bias, LARGEST_SLOPE_RAW, field.least_slope, ctx.whole_from, where.count
+            flags = where.each, hidden.shape[1], not field.contracted, colored, ctx.whole_from > 0, BLOCK
+            _activate_back[where.programs](*arrays, of_hidden, of_raw, *numbers, *flags)
+        return of_hidden, of_raw if colored else None, None, None, None, None
+
+
+@triton.jit
+@no_type_check
+def _midpoint(ray_index, starts, ends, sample, valid, each: tl.constexpr):
+    """Return the ray of some samples, and the distances of their middles."""
+    if each > 0:
+        ray = sample // each
+        shift = ray
+    else:
+        ray = tl.load(ray_index + sample, mask=valid, other=0)
+        shift = ray * 0
+    begin = tl.load(starts + sample + shift, mask=valid, other=0.0)
+    return ray, 0.5 * (begin + tl.load(ends + sample + shift, mask=valid, other=0.0))
+
+
+@triton.jit
+@no_type_check
+def _coordinate(origins, directions, aabb, ray, t, valid, axis: tl.constexpr):
+    """Return one coordinate of points on rays, in shares of the box's side."""
+    low, high = tl.load(aabb + axis), tl.load(aabb + 3 + axis)
+    origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0)
+    return (origin + t * tl.load(directions + 3 * ray + axis, mask=valid, other=0.0) - low) / (high - low)
+
+
+@triton.jit
+@no_type_check
+def _locate(
+    origins, directions, aabb, ray_index, starts, ends, out, count,
+    each: tl.constexpr, contracted: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
+    valid = sample < count
+    ray, t = _midpoint(ray_index, starts, ends, sample, valid, each)
+    x = _coordinate(origins, directions, aabb, ray, t, valid, 0)
+    y = _coordinate(origins, directions, aabb, ray, t, valid, 1)
+    z = _coordinate(origins, directions, aabb, ray, t, valid, 2)
+    if (
+        contracted
+    ):  # `geometry.contraction`: the box's corners lie on the unit ball, the ball of radius 2 fills the cube
+        x, y, z = (2.0 * x - 1.0) / 1.7320508, (2.0 * y - 1.0) / 1.7320508, (2.0 * z - 1.0) / 1.7320508
+        norm = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
+        scale = 0.25 * (2.0 - 1.0 / norm) / norm
+        x, y, z = x * scale + 0.5, y * scale + 0.5, z * scale + 0.5
+    tl.store(out + 3 * sample, x, mask=valid)
+    tl.store(out + 3 * sample + 1, y, mask=valid)
+    tl.store(out + 3 * sample + 2, z, mask=valid)
+
+
+@triton.jit
+@no_type_check
+def _join(
+    hidden, shared, ray_index, out, count, own: tl.constexpr, common: tl.constexpr,
+    each: tl.constexpr, width: tl.constexpr, rows: tl.constexpr,
+):  # fmt: skip
+    sample = (tl.program_id(0) * rows + tl.arange(0, rows)).to(tl.int64)[:, None]
+    column, valid = tl.arange(0, width)[None, :], sample < count
+    ray = sample // each if each > 0 else tl.load(ray_index + sample, mask=valid, other=0)
+    of_sample = tl.load(hidden + sample * own + column, mask=valid & (column < own), other=0.0)
+    of_ray = valid & (column >= own) & (column < own + common)
+    of_ray = tl.load(shared + ray * common + column - own, mask=of_ray, other=0.0)
+    total: tl.constexpr = own + common
+    tl.store(out + sample * total + column, tl.where(column < own, of_sample, of_ray), mask=valid & (column < total))
+
+
+@triton.jit
+@no_type_check
+def _inside(points, sample, valid):
+    """Tell whether points lie in the unit cube."""
+    x = tl.load(points + 3 * sample, mask=valid, other=0.0)
+    y = tl.load(points + 3 * sample + 1, mask=valid, other=0.0)
+    z = tl.load(points + 3 * sample + 2, mask=valid, other=0.0)
+    nearest = tl.minimum(tl.minimum(x, y), z)
+    return (nearest >= 0.0) & (tl.maximum(tl.maximum(x, y), z) <= 1.0)
+
+
+@triton.jit
+@no_type_check
+def _activate(
+    hidden, raw, points, density, rgb, bias, largest, count,
+    width: tl.constexpr, boxed: tl.constexpr, colored: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
+    valid = sample < count
+    sigma = tl.load(hidden + sample * width, mask=valid, other=0.0) + bias
+    sigma = tl.exp(tl.minimum(sigma, largest, propagate_nan=tl.PropagateNan.ALL))
+    if boxed:
+        sigma = tl.where(_inside(points, sample, valid), sigma, 0.0)
+    tl.store(density + sample, sigma, mask=valid)
+    for channel in tl.static_range(3):
+        value = tl.zeros([block], tl.float32)
+        if colored:
+            value = tl.sigmoid(tl.load(raw + 3 * sample + channel, mask=valid, other=0.0))
+        tl.store(rgb + 3 * sample + channel, value, mask=valid)
+
+
+@triton.jit
+@no_type_check
+def _activate_back(
+    hidden, points, rgb, of_density, of_rgb, starts, ends, of_hidden, of_raw,
+    bias, largest, least_slope, whole_from, count,
+    each: tl.constexpr, width: tl.constexpr, boxed: tl.constexpr, colored: tl.constexpr, softened: tl.constexpr,
+    block: tl.constexpr,
+):  # fmt: skip
+    sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
+    valid = sample < count
+    share = tl.full([block], 1.0, tl.float32)
+    if softened:
+        shift = sample // each if each > 0 else sample * 0
+        t = tl.load(starts + sample + shift, mask=valid, other=0.0)
+        t = 0.5 * (t + tl.load(ends + sample + shift, mask=valid, other=0.0)) / whole_from
+        share = tl.minimum(t * t, 1.0)
+    x = tl.load(hidden + sample * width, mask=valid, other=0.0) + bias
+    slope = tl.exp(tl.minimum(tl.maximum(x, -largest), largest))
+    grad = tl.load(of_density + sample, mask=valid, other=0.0) * share * slope
+    if boxed:
+        grad = tl.where(_inside(points, sample, valid), grad, 0.0)
+    tl.store(of_hidden + sample * width, grad, mask=valid)
+    for column in tl.static_range(1, width):
+        tl.store(of_hidden + sample * width + column, tl.zeros([block], tl.float32), mask=valid)
+    if colored:
+        for channel in tl.static_range(3):
+            color = tl.load(rgb + 3 * sample + channel, mask=valid, other=0.0)
+            grad = tl.load(of_rgb + 3 * sample + channel, mask=valid, other=0.0) * share
+            slope = color * (1.0 - color)
+            # A step goes against the gradient: back from black, or from full.
+            slope = tl.where(grad * (color - 0.5) > 0.0, tl.maximum(slope, least_slope), slope)
+            tl.store(of_raw + 3 * sample + channel, grad * slope, mask=valid)
