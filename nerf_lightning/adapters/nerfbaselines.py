@@ -76,7 +76,7 @@ class NerfLightning(Method):
     def get_info(self) -> dict[str, Any]:
         return self.info
 
-    def train_iteration(self, step: int) -> dict[str, float]:
+    def train_iteration(self, step: int) -> dict[str, Any]:
         return next(self.steps)
 
     def render(self, camera: Any, *, options: Any = None) -> dict[str, np.ndarray]:

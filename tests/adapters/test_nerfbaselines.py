@@ -97,9 +97,9 @@ def test_rays_are_those_of_nerfbaselines(dataset):
 
     cameras = cameras_of(dataset["cameras"])
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    places = np.stack([x, y], -1).reshape(-1, 2) + 0.5
+    places = np.stack([x, y], -1).reshape(-1, 2).astype(np.int32)
     camera = dataset["cameras"][1]
-    _, theirs = nerfbaselines.cameras.get_rays(camera, places.astype(np.float32))
+    _, theirs = nerfbaselines.cameras.get_rays(camera, places)
     zeros = torch.zeros(6)
     ours = rays_through_pixels(cameras, all_pixels(cameras, 1), zeros, zeros).directions.reshape(-1, 3)
     theirs = theirs / np.linalg.norm(theirs, axis=-1, keepdims=True)

@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from support.orbit import orbit_scene
 
 import nerf_lightning as nl
+from nerf_lightning.checkpoints.format import FILE
 
 KEPT = Path(__file__).parent / "kept"
 NERF = (
@@ -78,6 +80,8 @@ def remake():
         for _ in run.steps(3):
             pass
         run.save(folder / f"{kind}.ckpt")
+        content = torch.load(folder / f"{kind}.ckpt", weights_only=True)
+        torch.save({key: content[key] for key in FILE}, folder / f"{kind}.ckpt")  # without what training goes on from
     results = {kind: [round(mean, 5) for mean in rendered(folder / f"{kind}.ckpt")] for kind in KINDS}
     (folder / "rendered.json").write_text(json.dumps(results, indent=2) + "\n")
 
