@@ -18,6 +18,7 @@ from nerf_lightning.adapters.nerfbaselines import cameras_of, scene_of  # noqa: 
 
 SETTINGS = {"model": "nerf_tiny", "trainer": "cpu", "data.batch_rays": 64, "data.crop_steps": 0, "max_steps": 8}
 SIZE = (20, 16)
+pytestmark = pytest.mark.filterwarnings("default")  # they are not ours
 
 
 class PsnrAlone(DefaultEvaluationProtocol):
@@ -98,7 +99,7 @@ def test_rays_are_those_of_nerfbaselines(dataset):
     cameras = cameras_of(dataset["cameras"])
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     places = np.stack([x, y], -1).reshape(-1, 2).astype(np.int32)
-    camera = dataset["cameras"][1]
+    camera = dataset["cameras"][np.full(len(places), 1)]
     _, theirs = nerfbaselines.cameras.get_rays(camera, places)
     zeros = torch.zeros(6)
     ours = rays_through_pixels(cameras, all_pixels(cameras, 1), zeros, zeros).directions.reshape(-1, 3)
