@@ -1,5 +1,6 @@
 """Our method in NerfBaselines itself: found, trained, rendered, evaluated, and resumed to the bit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ def dataset(request):
 
 
 def trained(dataset, output, checkpoint=None, steps=8):
+    output.mkdir()
     spec = nerfbaselines.get_method_spec("nerf-lightning")
     with nerfbaselines.build_method_class(spec, backend="python") as method_class:
         method = method_class(
@@ -97,6 +99,7 @@ def test_rays_are_those_of_nerfbaselines(dataset):
     from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 
     cameras = cameras_of(dataset["cameras"])
+    cameras = replace(cameras, c2w=cameras.c2w.float())
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     places = np.stack([x, y], -1).reshape(-1, 2).astype(np.int32)
     camera = dataset["cameras"][np.full(len(places), 1)]
