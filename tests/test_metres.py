@@ -15,7 +15,6 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record, scene_record
 from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.export.mesh import MeshExport
 from nerf_lightning.nerf.geometry.frames import similarity, told_length
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, depth_range, make_shots
@@ -70,13 +69,3 @@ def test_depth_as_a_picture_is_in_millimetres_unless_it_is_too_far(tmp_path, met
     assert (said["depth_scale"] == step) == (step is not None)
     picture = np.array(Image.open(tmp_path / "depth" / f"{name}.png"))
     np.testing.assert_allclose(picture * said["depth_scale"], np.nan_to_num(depth), atol=said["depth_scale"])
-
-
-def test_a_glb_has_its_size_in_metres(tmp_path):
-    trimesh = pytest.importorskip("trimesh", reason="the extra mesh is not installed")
-    sizes = {}
-    for metres in (METRES, None):
-        MeshExport(resolution=16, format="glb").export(solid(ball()), record(metres), tmp_path, TILE)
-        sizes[metres] = trimesh.load(tmp_path / "mesh.glb").extents
-    np.testing.assert_allclose(sizes[METRES], METRES * sizes[None], rtol=1e-5)
-    assert sizes[METRES] == pytest.approx(np.full(3, METRES * UNIT * 1.6), rel=0.1)

@@ -11,33 +11,33 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.trust import Mismatch
 
-NumberType = Literal["float32", "float16", "int8"]
-TYPES: dict[NumberType, torch.dtype] = {"float32": torch.float32, "float16": torch.float16, "int8": torch.int8}
 SWITCHES = {"bool": torch.bool, "uint8": torch.uint8}
-LARGEST_INT8 = 127
 
 
 @dataclass(frozen=True)
 class QuantizedRows:
-    """A table in a checkpoint, as `quantize_rows` has it."""
+    """A table in a checkpoint (`nerf prune` writes some)."""
 
     shape: list[int]
     starts: list[int]
+    """The first row of each of its blocks."""
     kept: UInt8[Tensor, "_"] | None
+    """Which rows are kept, as bits; the others are their block's mean of them. None: all."""
     values: Tensor
+    """Of the kept rows, in units of their block's scale."""
     scales: Tensor
     means: Tensor
 
 
 @dataclass(frozen=True)
 class QuantizedSwitches:
-    """A tensor of zeros and ones in a checkpoint, as `quantize_switches` has it."""
+    """A tensor of zeros and ones in a checkpoint, as bits, the first in the lowest of a byte."""
 
     shape: list[int]
     type: Literal["bool", "uint8"]
@@ -50,53 +50,6 @@ class Quantized:
 
     rows: dict[str, QuantizedRows]
     switches: dict[str, QuantizedSwitches]
-
-
-def quantize_rows(
-    table: Float[Tensor, "..."],
-    number: NumberType,
-    starts: Sequence[int] = (0,),
-    kept: Bool[Tensor, "rows"] | None = None,
-) -> dict[str, Any]:
-    """Return a table as it is kept: int8 in units of its block's largest magnitude over 127.
-
-    Args:
-        table: rows of features along the last axis; of one with more than two axes each number is a row.
-        number: the type that its numbers are kept in.
-        starts: the first row of each of its blocks (a hash grid's levels).
-        kept: the rows that are; the others come back as their block's mean of them. None: all.
-    """
-    rows = table.detach().float().cpu()
-    rows = rows if rows.ndim == 2 else rows.reshape(-1, 1)
-    kept = torch.ones(rows.shape[0], dtype=torch.bool) if kept is None else kept
-    ends = [*starts[1:], rows.shape[0]]
-    blocks = [(rows[a:b][kept[a:b]], rows[a:b][~kept[a:b]]) for a, b in zip(starts, ends, strict=True)]
-    largest = torch.stack([inside.abs().max() if inside.numel() else torch.tensor(0.0) for inside, _ in blocks])
-    scales = torch.where(largest > 0, largest / LARGEST_INT8, 1.0) if number == "int8" else torch.ones_like(largest)
-    values = rows[kept] / scales[_block_of(starts, rows.shape[0])[kept], None]
-    return {
-        "shape": list(table.shape),
-        "starts": list(starts),
-        "kept": None if bool(kept.all()) else to_bits(kept),
-        "values": (values.round() if number == "int8" else values).to(TYPES[number]),
-        "scales": scales,
-        "means": torch.stack([left.sum(0) / max(1, left.shape[0]) for _, left in blocks]),
-    }
-
-
-def quantize_switches(switches: Tensor) -> dict[str, Any]:
-    """Return a tensor of zeros and ones, of type bool or uint8, as it is kept."""
-    kind = next(name for name, dtype in SWITCHES.items() if dtype == switches.dtype)
-    return {"shape": list(switches.shape), "type": kind, "bits": to_bits(switches.flatten().bool().cpu())}
-
-
-def to_bits(switches: Bool[Tensor, "n"]) -> UInt8[Tensor, "bytes"]:
-    """Return switches as bytes, the first in the lowest bit.
-
-    >>> to_bits(torch.tensor([True, False, True, False, False, False, False, False, True])).tolist()
-    [5, 1]
-    """
-    return torch.from_numpy(np.packbits(switches.numpy(), bitorder="little"))
 
 
 def from_bits(bits: UInt8[Tensor, "bytes"], count: int) -> Bool[Tensor, "count"]:
@@ -133,12 +86,13 @@ def _table(table: QuantizedRows, place: str) -> Tensor:
     if table.values.shape[1:] != (width,) or table.means.shape != (len(table.starts), width):
         raise Mismatch(place, f"has rows of {tuple(table.values.shape)} in a table of {table.shape}")
     kept = torch.ones(count, dtype=torch.bool) if table.kept is None else from_bits(table.kept, count)
-    block = _block_of(table.starts, count)
+    block = block_of(table.starts, count)
     rows = table.means[block]
     rows[kept] = table.values.float() * table.scales[block[kept], None]
     return rows.view(table.shape)
 
 
-def _block_of(starts: Sequence[int], count: int) -> Tensor:
+def block_of(starts: Sequence[int], count: int) -> Int[Tensor, "rows"]:
+    """Return the number of each row's block, of blocks that begin at `starts`."""
     sizes = torch.tensor([b - a for a, b in zip(starts, [*starts[1:], count], strict=True)])
     return torch.repeat_interleave(torch.arange(len(starts)), sizes)

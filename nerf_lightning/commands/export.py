@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
-from nerf_lightning.video.paths.base import CameraPath, frame_of
+from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.shots import Subject, content_of, frame_around
 from nerf_lightning.viewer.recorded_path import RecordedPath
 
 Keyframes = tuple[dict[str, Any], ...]
@@ -49,10 +51,11 @@ def export(config: DictConfig) -> None:
     if what.needs_density:
         point_field(opened.model)
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
-    what.beside = beside(opened.checkpoint, photographs, path)
+    record = opened.checkpoint.scene
+    content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
+    what.beside = beside(opened.checkpoint, photographs, path, content)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
-        record = opened.checkpoint.scene
         if opened.model.needs_photographs:
             record = scene_record(scene_to_look_at(opened, None))
         written = what.export(opened.model, record, folder, opened.tile_points)
@@ -61,8 +64,13 @@ def export(config: DictConfig) -> None:
     say(*map(str, written))
 
 
-def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> PageExtras:
-    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene."""
+def beside(
+    checkpoint: Checkpoint,
+    photographs: Scene | None,
+    path: CameraPath | None,
+    content: Content,
+) -> PageExtras:
+    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path."""
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
         ("model", checkpoint.choices.get("model", "")),
@@ -70,13 +78,18 @@ def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath |
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
-    keyframes = () if path is None else page_path(path, checkpoint.scene, run)
+    keyframes = () if path is None else page_path(path, checkpoint.scene, run, content)
     return PageExtras(photographs, corrected, tuple(known), keyframes)
 
 
-def page_path(path: CameraPath, record: SceneRecord, run: Path) -> Keyframes:
+def page_path(
+    path: CameraPath,
+    record: SceneRecord,
+    run: Path,
+    content: Content = PathFrame.content,
+) -> Keyframes:
     """Return the keyframes of a path; of path=auto, those that `nerf view` saved last in the run's folder, if any."""
-    around = frame_of(record.cameras, record.aabb, to_user=record.to_user, view_names=record.view_names)
+    around = frame_around(record, content)
     if not isinstance(path, AutoPath):
         return tuple(map(asdict, as_keyframes(path, around)))
     folder = run / "viewer"

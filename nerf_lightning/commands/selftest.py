@@ -1,8 +1,7 @@
-"""Say whether this machine computes right: kernels, precisions, trainings, files; a table for a bug report."""
+"""Say whether this machine computes right: kernels, precisions, trainings; a table for a bug report."""
 
 import os
 import re
-import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,6 @@ from torch.utils import collect_env
 
 from nerf_lightning import __version__
 from nerf_lightning.compute.devices import has_tf32
-from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
@@ -23,11 +21,11 @@ from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_c
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.output_folder import output_folder
-from nerf_lightning.selftest import command_line, kernels, training
+from nerf_lightning.selftest import kernels, training
 from nerf_lightning.selftest.check import Row, carried_out, remarks, result_table
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
-TRAINERS = {"cpu": "cpu", "cuda": "gpu"}
+DEVICES = ("cpu", "cuda")
 FLAGS = re.compile(r"\b(sse4_2|avx|avx2|fma|avx512\w*|avx_\w+|amx\w*|asimd\w*|bf16|i8mm|sve\w*)\b")
 
 
@@ -40,7 +38,7 @@ def run(config: DictConfig) -> None:
     """
     began = time.perf_counter()
     settings: TrainerSettings = build(config.trainer)
-    if settings.device_type not in TRAINERS:
+    if settings.device_type not in DEVICES:
         raise InputError(
             f"nerf selftest knows CPUs and NVIDIA GPUs, and trainer.accelerator chose {settings.device_type}. Use "
             "trainer=cpu; for TPUs there is make test-xla."
@@ -61,23 +59,12 @@ def run(config: DictConfig) -> None:
 
 
 def _rows(settings: TrainerSettings) -> list[Row]:
-    """Do all checks; what is written for them vanishes at the end."""
-    device, chosen = settings.device, PRODUCTS[settings.precision]
+    """Do all checks."""
     precisions: tuple[MatmulPrecision, ...] = ("float32", "bfloat16")
     if has_tf32(settings.device_type):
         precisions = ("float32", "tf32", "bfloat16")
-    trainer = [f"trainer={TRAINERS[settings.device_type]}", f"trainer.precision={settings.precision}"]
-    with tempfile.TemporaryDirectory(prefix="nerf-selftest-") as work:
-        runs = command_line.CommandLine(Path(work), trainer)
-        try:
-            checks = [
-                *kernels.checks(device, precisions),
-                *training.checks(device, precisions),
-                *command_line.checks(runs, device, chosen),
-            ]
-            return [carried_out(check) for check in track(checks, transient=True, console=stderr_console())]
-        finally:
-            runs.pool.shutdown(cancel_futures=True)
+    checks = [*kernels.checks(settings.device, precisions), *training.checks(settings.device, precisions)]
+    return [carried_out(check) for check in track(checks, transient=True, console=stderr_console())]
 
 
 def _in_words(value: object) -> str:

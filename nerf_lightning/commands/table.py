@@ -9,7 +9,6 @@ from nerf_lightning.files.folders import PACKAGE
 from nerf_lightning.files.html import write_page
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import require_one_of
-from nerf_lightning.report.curves import psnr_curve
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
 from nerf_lightning.runs.table import ORDERS, result_table
@@ -27,9 +26,7 @@ def run(config: DictConfig) -> int:
     folders = [Path(name) for name in _names(config.runs)]
     scenes, models = (None if names is None else _names(names) for names in (config.scenes, config.models))
     found = find_results(folders, config.measured, scenes, models)
-    rows, notes = result_table(
-        found, config.sort, bool(config.published), bool(config.force), psnr_curve if config.curves else None
-    )
+    rows, notes = result_table(found, config.sort, bool(config.published), bool(config.force))
     count = len(found.measured)
     title = f"{count} run{'' if count == 1 else 's'}, sorted by {config.sort}"
     out = config.out or config.paths.output_dir

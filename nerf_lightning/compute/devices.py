@@ -46,13 +46,20 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
         return "mps", "as asked, untested"
     if accelerator == "tpu":
         return "xla", f"{xla_device.require_device()}, as asked"
-    if torch.cuda.is_available():
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = torch.cuda.is_available()
+    if found:
         return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
+    # Of a driver that is too old torch warns, and says how old.
+    reason = " ".join(str(told[-1].message).split())[:200].removeprefix("CUDA initialization: ") if told else ""
     if accelerator == "gpu":
         raise InputError(
-            "trainer=gpu: torch sees no CUDA device here. Use trainer=cpu or trainer=auto, or install a CUDA build "
-            "of torch and check nvidia-smi."
+            f"trainer=gpu: torch sees no CUDA device here. {reason}{' ' if reason else ''}Use trainer=cpu or "
+            "trainer=auto, or install a CUDA build of torch that suits the driver, which nvidia-smi shows."
         )
+    if reason:
+        log.warning("The CPU computes, since torch cannot use the GPU here: %s", reason)
     return "cpu", "no GPU found"
 
 

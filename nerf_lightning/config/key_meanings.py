@@ -109,7 +109,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
     (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),
-    (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.view path.views"),
+    (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.views"),
     (replace(AFTERWARDS, trust=Trust.WORDS), "path.**"),
     (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from traceback import extract_tb
 
 from hydra.errors import HydraException, InstantiationException
+from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.config.lightning_arguments import OWNED
@@ -54,12 +55,8 @@ def paragraph(error: BaseException, command: str) -> str | None:
         return (
             f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _is_out_of_memory(error)):
-        reason = " ".join(str(error).split()).partition(". ")[0] or "Python got none"
-        return (
-            f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
-            "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."
-        )
+    if isinstance(error, (MemoryError, RuntimeError)):
+        return _of_machine(error)
     if isinstance(error, OSError):
         # What is closed because of bad input may fail for the same cause, and be raised in the place of it.
         cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
@@ -70,11 +67,23 @@ def paragraph(error: BaseException, command: str) -> str | None:
     return None
 
 
-def _is_out_of_memory(error: RuntimeError) -> bool:
+def _of_machine(error: MemoryError | RuntimeError) -> str | None:
     # Imported late: it brings torch, which a config is composed without.
-    from nerf_lightning.nerf.models.tiles import is_out_of_memory
+    from nerf_lightning.nerf.models.tiles import is_device_failure, is_out_of_memory
 
-    return is_out_of_memory(error)
+    reason = " ".join(str(error).split())
+    if isinstance(error, MemoryError) or is_out_of_memory(error):
+        return (
+            f"There is no memory for this: {reason.partition('. ')[0] or 'Python got none'}. Use a smaller model or "
+            "smaller pictures, smaller tiles (trainer.tile_points), or another device (trainer=cpu); on a GPU, "
+            "nvidia-smi shows who else uses it."
+        )
+    if is_device_failure(error):
+        return (
+            f"The GPU has failed: {reason[:200]}. What was written before is whole. Try again; if it fails again, nerf "
+            "selftest tells whether the GPU computes right, and trainer=cpu does without it."
+        )
+    return None
 
 
 def _missing_plugin(message: str) -> str | None:
@@ -94,7 +103,7 @@ def explain(error: BaseException, command: str) -> str:
         if isinstance(link, InputError):
             return str(link)
         if isinstance(link, MissingMandatoryValue):
-            return _not_given(getattr(link, "full_key", None) or str(link), command)
+            return _not_given(link, command)
     if isinstance(error, InstantiationException):
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
@@ -117,14 +126,16 @@ def explain(error: BaseException, command: str) -> str:
     return unknown_name(message, command) or f"{message} {ALL_OF.format(command)}"
 
 
-def _not_given(key: str, command: str) -> str:
+def _not_given(error: MissingMandatoryValue, command: str) -> str:
+    key = error.full_key or str(error)
     if key not in ("ckpt", "run"):
         return f"nerf {command} needs {key}: add {key}=VALUE. nerf help {key} tells what it is."
-    last = max(Path("outputs").glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
+    root = OmegaConf.select(error.parent_node._get_root(), "paths.root_dir") if error.parent_node else "outputs"
+    last = max(Path(root).glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
     if last is None:
-        return f"nerf {command} needs a run, and outputs/ holds none: train one, or name its folder with {key}=DIR."
+        return f"nerf {command} needs a run, and {root}/ holds none: train one, or name its folder with {key}=DIR."
     newest = shlex.quote(str(last.parent.parent))  # cli/quoting.py does the rest
-    return f"nerf {command} needs a run. For the newest below outputs/, type: nerf {command} {key}={newest}"
+    return f"nerf {command} needs a run. For the newest below {root}/, type: nerf {command} {key}={newest}"
 
 
 def _chain(error: BaseException | None) -> list[BaseException]:

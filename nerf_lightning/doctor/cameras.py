@@ -21,6 +21,7 @@ NARROW, WIDE, WIDEST = 12.0, 100.0, 140.0
 OFF_CENTER, FAR_OFF_CENTER = 0.06, 0.2
 FEW, TOO_FEW = 15, 5
 FEW_MATCHES = 30
+STEP = 10.0  # Degrees between neighbours of a good ring of photographs.
 # Degrees between a held-out view and the nearest one that is learnt from.
 FAR_HELD_OUT = 40.0
 
@@ -203,8 +204,13 @@ def coverage(evidence: Evidence) -> Check:
     up = f"heights of {float(elevation.min()):.0f} to {float(elevation.max()):.0f} degrees"
     message = f"seen from {360 - widest:.0f} degrees around, from {up}"
     if len(gaps) > 8 and 50 < widest < 140:
-        at = float(around[int(gaps.argmax())] + widest / 2)
-        cure = f"Photographs are missing around {(at + 180) % 360 - 180:.0f} degrees (see doctor.png); take some there."
+        place = int(gaps.argmax())
+        at = (float(around[place]) + widest / 2 + 180) % 360 - 180
+        before, after = (scene.view_names[view] for view in azimuth.argsort().roll(-place)[:2].tolist())
+        cure = (
+            f"Take {math.ceil(widest / STEP)} more photographs between where {before} and {after} were taken, around "
+            f"{at:.0f} degrees on the coverage map."
+        )
         return look(f"{message}, with a gap of {widest:.0f} degrees", cure)
     return ok(message)
 

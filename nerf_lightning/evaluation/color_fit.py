@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 FEWEST = 8  # Pixels from which twelve numbers are not fitted
 HALF_A_LEVEL = 0.5 / 255
@@ -35,7 +35,7 @@ def color_corrected(
     count = render[..., 0].numel() if kept is None else int(kept.sum())
     if count < FEWEST:
         return render
-    parts = list(bands(*render.shape[:2]))
+    parts = list(row_chunks(*render.shape[:2]))
     sums = (torch.stack([counted(each, rows).sum(dim=0) for rows in parts]).sum(0) for each in (render, truth))
     at, to = (total / count for total in sums)
     # About the means, and by the pseudoinverse: of a picture of one colour nothing but its mean is fitted.

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.files.trust import reading, require_fit, require_like
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
@@ -85,38 +86,18 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
     """
     if weights is None:
         return None
-    start, cure = f"evaluation.lpips_weights={weights}:", f"To have LPIPS, {LPIPS_HINT}"
-    if not Path(weights).is_file():
-        raise InputError(f"{start} there is no such file. {cure}")
-    try:
-        state = load_tensors(Path(weights))
-    except InputError:
-        raise
-    except Exception as error:  # a file of another kind can fail in any way
-        raise InputError(f"{start} this is not a file of weights. {cure}") from error
+    path, cure = Path(weights), f"To have LPIPS, {LPIPS_HINT}"
+    if not path.is_file():
+        raise InputError(f"evaluation.lpips_weights={weights}: there is no such file. {cure}")
     model = LPIPS(net)
-    wrong = _mismatch(state, model.state_dict())
-    if wrong is not None:
-        raise InputError(f"{start} not the backbone {net!r}: {wrong}. {cure}")
-    model.load_state_dict({name: state[name] for name in model.state_dict()})
+    template = model.state_dict()
+    with reading(path, cure):
+        state = load_tensors(path)
+        require_fit(state, dict[str, object], "weights")
+        state = {name: tensor for name, tensor in state.items() if name.startswith("features.")}
+        require_like(state, template, "weights")
+    model.load_state_dict(state)
     return model.eval()
-
-
-def _mismatch(state: object, wanted: dict[str, Tensor]) -> str | None:
-    """Return what is wrong with a state dict in a few words, None if it fits."""
-    if not isinstance(state, dict):
-        return "it holds no table of tensors"
-    for name, tensor in wanted.items():
-        found = state.get(name)
-        if not isinstance(found, Tensor):
-            return f"{name} is missing"
-        if found.shape != tensor.shape:
-            return f"{name} has shape {tuple(found.shape)}, not {tuple(tensor.shape)}"
-        if not found.is_floating_point():
-            return f"{name} is of the type {str(found.dtype).removeprefix('torch.')}"
-        if not bool(torch.isfinite(found).all()):
-            return f"{name} holds NaN or infinity"
-    return None
 
 
 def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:

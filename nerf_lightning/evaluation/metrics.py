@@ -14,9 +14,9 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected, is_one_color
-from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
@@ -63,9 +63,9 @@ def image_metrics(
 
 
 def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float:
-    # torchmetrics' mean over all windows, those that reach over the border included, by bands of their middles.
+    # torchmetrics' mean over all windows, those that reach over the border included, by chunks of their middles.
     height, reach, total = render.shape[0], SSIM_WINDOW // 2, 0.0
-    for rows in bands(height, render.shape[1]):
+    for rows in row_chunks(height, render.shape[1]):
         top, bottom = max(0, rows.start - reach), min(height, max(rows.stop + reach, SSIM_WINDOW))
         ours, true = (picture[top:bottom].movedim(-1, 0)[None] for picture in (render, truth))
         _, each = structural_similarity_index_measure(ours, true, data_range=1.0, return_full_image=True)

@@ -1,18 +1,17 @@
-"""The cameras, in the user's frame, as other programs read them: `transforms.json`, a COLMAP model, an animation."""
+"""The cameras, in the user's frame, as other programs read them: `transforms.json` and a COLMAP model."""
 
 import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
-from nerf_lightning.export.base import Export, require_free, require_setting
+from nerf_lightning.export.base import Export, require_free
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
@@ -22,8 +21,6 @@ from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 
-CamerasFormat = Literal["transforms", "nerfstudio", "blender"]
-ANIMATIONS = {"nerfstudio": "camera_path.json", "blender": "cameras_blender.py"}
 CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
     "radial_tangential": "OPENCV",
@@ -40,30 +37,19 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class CamerasExport(Export):
-    """Write where the photographs were taken, and through what lens.
+    """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the pictures of the training.
 
     Args:
         images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
-        format: `transforms` writes `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the
-            pictures of the training; `nerfstudio` `camera_path.json`, a film of the photographs for `ns-render
-            camera-path`; `blender` `cameras_blender.py`, which makes the same film's keyframes when Blender runs it.
-        fps: photographs per second of such a film.
     """
 
     needs_density = False
 
     images: str | None = None
-    format: CamerasFormat = "transforms"
-    fps: int = 24
-
-    def __post_init__(self) -> None:
-        require_setting("fps", self.fps, self.fps >= 1, "give 1 or more photographs per second.")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the files."""
         cameras = in_user_frame(record)
-        if self.format != "transforms":
-            return [self._animation(cameras, record.view_names, folder / ANIMATIONS[self.format])]
         transforms = folder / "transforms.json"
         require_free(files=[transforms], folders=[folder / "sparse", folder / "sparse" / "0"])
         write_json(transforms, self._transforms(record, cameras))
@@ -72,18 +58,9 @@ class CamerasExport(Export):
             return [transforms]
         sparse = make_folder(folder, "sparse", "0")
         for name, text in colmap_files(cameras, record.view_names).items():
-            _write_text(sparse / name, text)
+            with whole_file(sparse / name) as part:
+                part.write_text(text, encoding="utf-8")
         return [transforms, sparse]
-
-    def _animation(self, cameras: Cameras, names: Sequence[str], path: Path) -> Path:
-        require_free(files=[path])
-        if self.format == "blender":
-            _write_text(path, blender_script(cameras, names, self.fps))
-        else:
-            write_json(path, nerfstudio_path(cameras, self.fps))
-        if lost := beyond_pinholes(cameras, shifts=self.format == "blender"):
-            log.warning("%s does not say %s.", path.name, ", or ".join(lost))
-        return path
 
     def _transforms(self, record: SceneRecord, cameras: Cameras) -> dict[str, Any]:
         prefix = f"{self.images.rstrip('/')}/" if self.images else ""
@@ -94,11 +71,6 @@ class CamerasExport(Export):
             for split, views in record.splits.items():
                 content[f"{split}_filenames"] = [names[view] for view in views]
         return content
-
-
-def _write_text(path: Path, text: str) -> None:
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
 
 
 def in_user_frame(record: SceneRecord) -> Cameras:

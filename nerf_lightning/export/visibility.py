@@ -1,20 +1,15 @@
-"""What the photographs show: where the light of each pixel was stopped, whether views agree, which faces are seen."""
+"""What the photographs show: where the light of each pixel was stopped, and whether views agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.export.density_grid import Report
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
-from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, seen_at
-from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.cameras import camera_coordinates, seen_at
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -89,39 +84,3 @@ def num_agreeing(
         inside, x, y = seen_at(cameras, view, points)
         count += inside & ((depths[view][y, x] - distance).abs() <= tolerance * distance)
     return count
-
-
-VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.
-TOLERANCE = 0.015  # A vertex is seen where a view's depth is its distance, up to this share of it.
-OPAQUE = 0.5  # Pixels that stop less light see no surface.
-RINGS = 2  # The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
-
-
-def seen_faces(
-    model: Model,
-    record: SceneRecord,
-    vertices: Float[ndarray, "vertices 3"],
-    faces: Int[ndarray, "faces 3"],
-    tile_points: int,
-    report: Report,
-) -> Int[ndarray, "seen 3"]:
-    """Return the faces that a training view sees, or whose neighbours it does, of which there must be some."""
-    cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
-    points = torch.from_numpy(vertices).float()
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for number, view in enumerate(views):
-        picture = see(model, record, cameras, view, tile_points)
-        depth = torch.where(picture.opacity > OPAQUE, picture.depth, torch.inf)
-        seen |= num_agreeing(points, cameras, {view: depth}, [view], TOLERANCE) > 0
-        report("views", (number + 1) / len(views))
-    known = seen.numpy()
-    kept = known[faces].any(axis=1)
-    for _ in range(RINGS):
-        known[faces[kept]] = True
-        kept = known[faces].any(axis=1)
-    if not kept.any():
-        raise InputError(
-            "No training view sees any part of the mesh as its surface: what.threshold is far from the density that "
-            "the views end in. Give another, or what.threshold=null, or what.seen_only=false."
-        )
-    return np.ascontiguousarray(faces[kept])

@@ -17,8 +17,6 @@ from nerf_lightning.messages.escaping import listed
 MARK = ".made_by_nerf_lightning"  # An empty file in each folder that may be emptied
 LOCK = "lock"
 
-_new: set[Path] = set()
-
 
 def below(root: Path, *names: str) -> Path:
     """Return a place in a folder that the user named (it may be a link), which is reached through no link."""
@@ -48,13 +46,6 @@ def make_folder(root: Path, *names: str) -> Path:
 def make_new_folder(folder: Path) -> None:
     """Make a folder of a name that nothing has, and those around it that are missing."""
     folder.mkdir(parents=True)
-    _new.add(folder)
-
-
-def remove_new_folder(folder: Path) -> None:
-    """Remove a folder that `make_new_folder` made in this process, with all that is in it, as far as that can be."""
-    if folder in _new:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def remove_empty(*folders: Path) -> None:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 LEAST_MSE = 1e-10
 """Errors below count as this one, a PSNR of 100 dB."""
@@ -28,7 +28,7 @@ def picture_psnr(
 ) -> float:
     """Return the PSNR (dB) of a picture, of the pixels that are kept (at least one; None: all)."""
     total, count = 0.0, 0
-    for rows in bands(*render.shape[:2]):
+    for rows in row_chunks(*render.shape[:2]):
         error = (render[rows] - truth[rows]).square()
         error = error if kept is None else error[kept[rows]]
         total, count = total + float(error.sum(dtype=torch.float64)), count + error.numel()

@@ -192,7 +192,7 @@ def build_run(
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
     scene = build(config.scene).read() if scene is None else scene
-    config, choices = resolve_auto(config, choices, overrides, scene)
+    config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type == "cuda")
     chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
     config, choices = resolve_correction(config, choices, overrides, former=chosen_before)
     guards = config.callbacks.collapse_guard, config.callbacks.nan_guard

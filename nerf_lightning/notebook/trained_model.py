@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
-from nerf_lightning.video.shots import Subject, lay_path, shot_of
+from nerf_lightning.video.shots import Subject, content_of, lay_path, shot_of
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,9 @@ class TrainedModel:
         overrides = [f"path={name}", *(f"path.{key}={quoted(value)}" for key, value in settings.items())]
         with in_words("render"):
             config, _ = compose_config("render", overrides)
-            return replace(self.scene, cameras=lay_path(build(config.path), self.scene)).user_cameras
+            subject = Subject(self.module, self.scene, self.scene.background)
+            cameras = lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
+            return replace(self.scene, cameras=cameras).user_cameras
 
     def of_scene(self, scene: Scene) -> "TrainedModel":
         """Return the same network for another scene, which it renders from the photographs of that scene from now on.

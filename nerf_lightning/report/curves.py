@@ -97,27 +97,6 @@ def _draw(chart: Chart, curves: Mapping[str, Curve]) -> bytes:
 
 
 MOST_POINTS = 1000
-VALIDATION = "PSNR/validation"
-FEWEST_POINTS, FEWEST_VALIDATIONS = 3, 8
-"""Of fewer points, nobody sees a curve; of fewer validations, that of the batches is taken instead."""
-
-
-def psnr_curve(run: Path) -> Sequence[float]:
-    """Return the PSNR of a run as it rose: that of the validation where there are enough, else of the batches.
-
-    It is empty where the run has no TensorBoard files that can be read.
-    """
-    try:
-        curves = read_curves(run / "tensorboard")
-    except (InputError, OSError):
-        return []
-    validated = curves[VALIDATION][1] if VALIDATION in curves else []
-    training = [tag for tag in curves if CHARTS[0].tags.fullmatch(tag) and tag != VALIDATION]
-    of_levels = [curves[tag][1] for tag in training]
-    # The last level is the picture.
-    values = validated if len(validated) >= FEWEST_VALIDATIONS or not of_levels else of_levels[-1]
-    finite = [value for value in values if math.isfinite(value)]
-    return finite if len(finite) >= FEWEST_POINTS else []
 
 
 def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:

@@ -1,8 +1,7 @@
 """Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
 
 import statistics
-from collections.abc import Callable, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
 
 from nerf_lightning.config.key_meanings import meaning_of
@@ -43,17 +42,12 @@ NOTED = ("version", "commit", "device", "precision")
 MOST_SETTINGS = 32
 """Columns of settings by which runs differ: a stranger's run may have thousands."""
 MOST_LETTERS = 80
-MOST_CURVES = 40  # Rows whose curves are read, which takes time
 
 Group = list[RunResult]
-CurveReader = Callable[[Path], Sequence[float]]
-"""Returns the PSNR over the length of the run in a folder, empty if it is not known."""
 
 
-def result_table(
-    found: FoundResults, order: str, published: bool, force: bool, curve_of: CurveReader | None
-) -> tuple[list[Row], list[str]]:
-    """Return the rows, in one of `ORDERS`, and the lines that belong below them; a `curve_of` of None: no curves.
+def result_table(found: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
+    """Return the rows, in one of `ORDERS`, and the lines that belong below them.
 
     `force` puts results together that were not measured alike.
     """
@@ -62,8 +56,7 @@ def result_table(
     groups.sort(key=lambda group: _rank(group, order))
     differing = differing_keys([group[0].settings for group in groups])
     shown, hidden = differing[:MOST_SETTINGS], differing[MOST_SETTINGS:]
-    curves = relative_curves(groups[:MOST_CURVES], curve_of) if curve_of else []
-    rows = [_row(group, shown, curve) for group, curve in zip_longest(groups, curves)]
+    rows = [_row(group, shown) for group in groups]
     if published:
         rows = with_published(rows, found.measured)
     if hidden:
@@ -144,21 +137,6 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
     return [list(seeds.values()) for seeds in groups.values()], left_out
 
 
-def relative_curves(groups: Sequence[Group], curve_of: CurveReader) -> list[list[float]]:
-    """Return the curve of each group's newest run, in parts of the range that the curves of its scene fill."""
-    curves = [curve_of(group[0].folder) for group in groups]
-    relative = []
-    for group, curve in zip(groups, curves, strict=True):
-        reached = [
-            value
-            for each, values in zip(groups, curves, strict=True)
-            if each[0].scene == group[0].scene
-            for value in values
-        ]
-        relative.append([(value - min(reached)) / (max(reached) - min(reached) or 1.0) for value in curve])
-    return relative
-
-
 def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
     """Return the rows with what others have published below those of each scene."""
     reader = {result.scene: str(result.origin.get("scene", "")) for result in results}
@@ -173,7 +151,7 @@ def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
     return table
 
 
-def _row(group: Group, shown: list[str], curve: list[float] | None) -> Row:
+def _row(group: Group, shown: list[str]) -> Row:
     first = group[0]
     row: Row = {"scene": first.scene, "model": first.model}
     unsaid = _values_of(first.folder, [key for key in shown if key not in first.settings])
@@ -182,7 +160,7 @@ def _row(group: Group, shown: list[str], curve: list[float] | None) -> Row:
     row |= {"resolution": _resolution(first), "seeds": " ".join(map(str, seeds))}
     for metric, column in SPREAD.items():
         mean, deviation = _spread(group, metric)
-        row |= {column: mean, f"{column} std": deviation} | ({"curve": curve or None} if metric == "psnr" else {})
+        row |= {column: mean, f"{column} std": deviation}
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
     row["steps"] = None if row["steps"] is None else round(row["steps"])
     others = f" and {len(group) - 1} more" if len(group) > 1 else ""

@@ -22,15 +22,12 @@ DECIMALS = {
 }
 """Columns of numbers, and the digits that are shown."""
 SECONDS = {"seconds": 1, "minutes": 60}  # Columns of times, in seconds each
-BLOCKS = "▁▂▃▄▅▆▇█"
-SPARKLINE = 12  # Signs in which a curve is drawn
 
 
 def write_csv(rows: list[Row], path: Path) -> None:
-    """Write the rows with all digits; curves are left out."""
-    columns = [column for column in rows[0] if column != "curve"]
+    """Write the rows with all digits."""
     with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        lines = (columns, *([row[column] for column in columns] for row in rows))
+        lines = (rows[0], *(row.values() for row in rows))
         csv.writer(file).writerows(map(for_csv, line) for line in lines)
 
 
@@ -40,17 +37,6 @@ def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> No
     text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *lines))
     with whole_file(path) as part:
         part.write_text(text + "".join(f"\n{for_markdown(note)}\n" for note in notes), encoding="utf-8")
-
-
-def sparkline(curve: Sequence[float]) -> str:
-    """Return a curve as a word of blocks, the lowest for 0 and the highest for 1.
-
-    >>> sparkline([0.0, 0.2, 0.5, 1.0])
-    '▁▂▅█'
-    """
-    count = min(SPARKLINE, len(curve))
-    picked = [curve[round(place * (len(curve) - 1) / max(count - 1, 1))] for place in range(count)]
-    return "".join(BLOCKS[min(int(value * len(BLOCKS)), len(BLOCKS) - 1)] for value in picked)
 
 
 def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
@@ -76,8 +62,6 @@ def shown(row: Row, column: str) -> str:
     value = row.get(column)
     if value is None:
         return ""
-    if column == "curve":
-        return sparkline(value)
     if column in DECIMALS and not isinstance(value, str):
         return f"{value:,.{DECIMALS[column]}f}"
     # What a sampler proposes has digits that nobody reads.

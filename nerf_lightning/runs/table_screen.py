@@ -19,7 +19,7 @@ from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns
 FIRST = ("job", "model", "PSNR", "resolution", "scene")
 """Columns that are worth most, before the settings by which rows differ."""
 NEXT = (
-    *("state", "time", "curve", "steps", "SSIM", "cc PSNR", "seeds", "folder", "LPIPS"),
+    *("state", "time", "steps", "SSIM", "cc PSNR", "seeds", "folder", "LPIPS"),
     *("depth error", "normal error", "parameters", "MB", "frames/s"),
 )
 """And those that are worth less, in their order."""

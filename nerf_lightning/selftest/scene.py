@@ -1,8 +1,5 @@
 """The scene of the self-test: a ball whose colour is its normal, traced on the spot."""
 
-from pathlib import Path
-
-import numpy as np
 import torch
 
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
@@ -46,12 +43,3 @@ def ball_scene() -> Scene:
         protocol={},
         truth=None,
     )
-
-
-def write_npz(path: Path) -> None:
-    """Write the ball in front of black, as a capture that the command line reads (scene=npz)."""
-    scene = ball_scene()
-    pictures = torch.stack([scene.pixels.view(view) for view in range(NUM_VIEWS)]).float() / 255
-    poses = torch.eye(4).repeat(NUM_VIEWS, 1, 1)
-    poses[:, :3] = scene.cameras.c2w
-    np.savez(path, images=(pictures[..., :3] * pictures[..., 3:]).numpy(), poses=poses.numpy(), focal=FOCAL)

@@ -18,8 +18,7 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import batch_size
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.corrections.base import Correction
-from nerf_lightning.nerf.corrections.none import NoCorrection
+from nerf_lightning.nerf.corrections.base import Correction, NoCorrection
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread

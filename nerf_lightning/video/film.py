@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-from collections.abc import Generator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -30,9 +29,6 @@ from nerf_lightning.visualization.pictures import save_png, straight_colors
 
 log = logging.getLogger(__name__)
 
-FilmSteps = Generator[tuple[int, int], None, list[Path]]
-"""A film in the making: how many frames of how many are there, again and again, and at the end the films."""
-
 
 def film(
     subjects: list[Subject], path: CameraPath, tile_points: int, folder: Path, settings: FilmSettings | None = None
@@ -46,36 +42,7 @@ def film(
     Raises:
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
-    steps = film_steps(subjects, path, tile_points, folder, FilmSettings() if settings is None else settings)
-    _, total = next(steps)
-    for _ in tracked(range(total), "filming"):
-        next(steps)
-    return films_of(steps)
-
-
-def films_of(steps: FilmSteps) -> list[Path]:
-    """Make the films whose frames are all there, and return them, or their folders of frames."""
-    try:
-        next(steps)
-    except StopIteration as end:
-        films: list[Path] = end.value
-        return films
-    raise AssertionError("there are frames left")
-
-
-def film_steps(
-    subjects: list[Subject],
-    path: CameraPath,
-    tile_points: int,
-    folder: Path,
-    settings: FilmSettings,
-    shows_encoding: bool = True,
-) -> FilmSteps:
-    """Film a frame at a time, for who has something else to do between two; the arguments are those of `film`.
-
-    Yields how many frames of how many are there: at first, and after each. Then `films_of` makes the films;
-    `shows_encoding`: show in the terminal how far that is.
-    """
+    settings = settings or FilmSettings()
     _check(subjects, settings)
     if settings.alpha:
         subjects = [replace(subject, background="black") for subject in subjects]
@@ -87,17 +54,13 @@ def film_steps(
     films = ["mosaic"] if settings.mosaic else [FILMS.get(name, name) for name in settings.outputs]
     if settings.form == "exr":
         films = ["exr"]  # all in one file
-    frames = FilmFrames(
-        folder, films, len(shots[0].cameras.c2w), settings.form, shows_encoding, [FILMS["rgb"]] * settings.alpha
-    )
+    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form, [FILMS["rgb"]] * settings.alpha)
     try:
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         if "depth" in settings.outputs and ranks.is_first():
             log.info("depth is in %s, and most of it lies from %.3g to %.3g", told_length(first)[1], *seen)
-        mine = ranks.every_other(missing)
-        yield 0, len(mine)
-        for done, number in enumerate(mine, start=1):
+        for number in tracked(ranks.every_other(missing), "filming"):
             if settings.form == "exr":
                 view = shots[0].picture(number)
                 depth = shots[0].z_depth(number, view) if "depth" in settings.outputs else None
@@ -106,7 +69,6 @@ def film_steps(
             else:
                 for name, picture in _frame(shots, settings, number, seen).items():
                     frames.save(name, number, partial(save_png, picture=picture))
-            yield done, len(mine)
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
             frames.finish(path.fps)

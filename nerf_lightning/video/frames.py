@@ -35,7 +35,6 @@ class FilmFrames:
         count: how many frames each has.
         form: `frames` and `exr` are the result; the others keep frames in a hidden folder until one file is made of
             them.
-        shows_encoding: show in the terminal how far `finish` is.
         transparent: those of the films whose frames have alpha.
     """
 
@@ -45,11 +44,10 @@ class FilmFrames:
         films: Sequence[str],
         count: int,
         form: Form,
-        shows_encoding: bool = True,
         transparent: Collection[str] = (),
     ) -> None:
-        self.shows_encoding, self.transparent = shows_encoding, transparent
         self.folder, self.films, self.count, self.form = folder, films, count, form
+        self.transparent = transparent
         self.scratch = ScratchFolder(folder, HIDDEN, "is filming")
         self.root = self.scratch.path if ENDINGS[form] else folder
         self.suffix = ".exr" if form == "exr" else ".png"
@@ -120,7 +118,7 @@ class FilmFrames:
 
     def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width channels"]]:
         numbers, channels = range(self.count), 4 if film in self.transparent else 3
-        for number in tracked(numbers, f"encoding {film}") if self.shows_encoding else numbers:
+        for number in tracked(numbers, f"encoding {film}"):
             file = self._file(film, number)
             try:
                 yield torch.from_numpy(read_rgba(file)[..., :channels].copy())

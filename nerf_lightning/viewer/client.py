@@ -10,7 +10,6 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
-from nerf_lightning.video.settings import Corner
 from nerf_lightning.viewer.camera_state import CameraState, fov_that_holds, pose_of, quaternion_of
 from nerf_lightning.viewer.channels import COLOR, FARTHEST, in_window, picture_of, planar_depth, wiped
 from nerf_lightning.viewer.progressive import ProgressiveRendering
@@ -39,8 +38,6 @@ class ViewerClient:
         self.refinement = ProgressiveRendering(self._show, most_height)
         self.channel, self.split = COLOR, 0.5
         self.crop: CropBox | None = None
-        self.crop_corners: tuple[Corner, Corner] | None = None
-        """The same, in the user's frame and units."""
         self.photograph: int | None = None
         """The view whose camera is looked through."""
         self.on_finest: Callable[[], None] = lambda: None
@@ -88,7 +85,7 @@ class ViewerClient:
 
     def is_here(self) -> bool:
         """Tell whether the person has not left."""
-        return self.queue.turn_of(self.client.client_id) is not None
+        return self.queue.serves(self.client.client_id)
 
     def enter(self, view: int) -> None:
         """Look through the camera of a photograph."""

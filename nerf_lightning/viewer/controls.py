@@ -1,4 +1,4 @@
-"""The panel of the page: what is shown, the crop box, photographs, the camera path, films, snapshots."""
+"""The panel of the page: what is shown, the crop box, photographs, the camera path, snapshots."""
 
 import math
 from pathlib import Path
@@ -11,7 +11,6 @@ from nerf_lightning.nerf.geometry.frames import points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.film import FilmPanel
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.path_panel import PathPanel
 from nerf_lightning.viewer.photograph_panel import PhotographPanel
@@ -28,7 +27,7 @@ class Controls:
     """The panel of one person, who first sees a vertical field of `fov` (radians); what they save lies in `folder`."""
 
     def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
-        self.session, self.folder, self.training = session, folder, training
+        self.session, self.folder = session, folder
         self.gui = session.client.gui
         self.harmless = session.queue.errors.harmless
         self.frusta = Frusta(session, lambda view: self.photographs.enter(view))
@@ -40,7 +39,6 @@ class Controls:
         self._add_view(min(max(float(round(math.degrees(fov))), LEAST_DEGREES), MOST_DEGREES))
         self.photographs = PhotographPanel(session, self.frusta)
         PathPanel(session, self.path, self.frusta)
-        self.film = FilmPanel(session, self.path, self._why_no_film)
         self._add_crop()
 
     def _add_view(self, degrees: float) -> None:
@@ -66,10 +64,6 @@ class Controls:
             self.session.refinement.refresh()
             self.session.queue.wake()
 
-    def _why_no_film(self) -> str | None:
-        paused = self.training is None or self.training.wants_pause
-        return None if paused else "The model changes while it trains. Pause the training first, then film it."
-
     def _add_crop(self) -> None:
         record = self.session.photographs.record
         with self.gui.add_folder("Crop box", expand_by_default=False):
@@ -85,7 +79,6 @@ class Controls:
         def update(_: Any) -> None:
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
-            self.session.crop_corners = (lower, upper) if on.value else None
             self.frusta.draw_box(self.session.crop)
             self.session.look()
 

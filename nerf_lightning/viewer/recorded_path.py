@@ -1,7 +1,7 @@
 """A camera path that somebody makes of keyframes: added, changed, read from a file, and saved as one."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import accumulate, count, pairwise
@@ -112,16 +112,6 @@ def keyframe_of(
     return Keyframe(position=eye, look_at=target, up=top, fov=round(degrees, 3))
 
 
-def first_free(folder: Path, stem: str, ending: str, make: Callable[[Path], None]) -> Path:
-    """Make what has the first number in its name that is free, and return where it is."""
-    for number in count(1):
-        path = folder / f"{stem}_{number:03d}{ending}"
-        with suppress(FileExistsError):
-            make(path)
-            break
-    return path
-
-
 @contextmanager
 def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
     """Lend a path with the first number that no file has; names never come from the page.
@@ -130,7 +120,11 @@ def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
     block fails.
     """
     make_folder(folder)
-    path = first_free(folder, stem, ending, lambda path: path.touch(exist_ok=False))
+    for number in count(1):
+        path = folder / f"{stem}_{number:03d}{ending}"
+        with suppress(FileExistsError):
+            path.touch(exist_ok=False)
+            break
     try:
         yield path
     except BaseException:

@@ -4,35 +4,14 @@ import logging
 import signal
 import threading
 import time
-from typing import Protocol, runtime_checkable
 
 from nerf_lightning.viewer.error_log import ErrorLog
+from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.renderer import SlicedRenderer
 
 IDLE_SECONDS = 0.2
 
 log = logging.getLogger(__name__)
-
-
-@runtime_checkable
-class Turn(Protocol):
-    """Something that is rendered slice by slice, in turn with others."""
-
-    served: float
-    """When it last had a turn (queue's clock)."""
-
-    @property
-    def is_moving(self) -> bool:
-        """Whether somebody waits for it more than for others."""
-
-    def work(self, renderer: SlicedRenderer) -> bool:
-        """Render a slice; return False where nothing is left to do."""
-
-    def refresh(self) -> None:
-        """Render again: the model has changed."""
-
-    def give_up(self) -> None:
-        """Drop what could not be rendered."""
 
 
 class RenderQueue:
@@ -41,12 +20,12 @@ class RenderQueue:
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
         self.errors = ErrorLog(log)
-        self._refinements: dict[int, Turn] = {}
+        self._refinements: dict[int, ProgressiveRendering] = {}
         self._lock = threading.Lock()
         self._wish = threading.Event()
 
-    def add(self, client: int, refinement: Turn) -> None:
-        """Render for a client from now on, or a film (`film.FILM`)."""
+    def add(self, client: int, refinement: ProgressiveRendering) -> None:
+        """Render for a client from now on."""
         with self._lock:
             self._refinements[client] = refinement
         self.wake()
@@ -56,9 +35,9 @@ class RenderQueue:
         with self._lock:
             self._refinements.pop(client, None)
 
-    def turn_of(self, client: int) -> Turn | None:
-        """Return what is rendered for a client, or None."""
-        return self._refinements.get(client)
+    def serves(self, client: int) -> bool:
+        """Tell whether a client has not left."""
+        return client in self._refinements
 
     def wake(self) -> None:
         """Say that a client wants another picture."""

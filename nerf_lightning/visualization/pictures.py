@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_terminal
-from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 ENOUGH_PIXELS = 1 << 18  # For the range of what is visible.
 ERROR_SCALE = 0.25  # Absolute error that gets the brightest colour: always the same, so that two runs can be compared.
@@ -37,7 +37,7 @@ def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
     [[0, 128, 255]]
     """
     picture = torch.empty(rgb.shape, dtype=torch.uint8)
-    for rows in bands(len(rgb), max(1, rgb[:1].numel())):
+    for rows in row_chunks(len(rgb), max(1, rgb[:1].numel())):
         picture[rows] = (torch.nan_to_num(rgb[rows].detach().float()).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
     return picture
 
@@ -110,7 +110,7 @@ def depth_picture(
     Where `opacity` is given, what light passes through fades to pale grey.
     """
     picture = torch.empty(*depth.shape, 3, dtype=torch.uint8)
-    for rows in bands(*depth.shape):
+    for rows in row_chunks(*depth.shape):
         colors = color_map(depth[rows], low=far, high=near)
         picture[rows] = to_bytes(colors if opacity is None else faded(colors, opacity[rows]))
     return _with_scale(picture, top=near, bottom=far)
@@ -129,7 +129,7 @@ def error_picture(
 ) -> UInt8[Tensor, "height wider 3"]:
     """Return the absolute error (mean of the channels) in colours, 0 to `ERROR_SCALE`, with its scale."""
     picture = torch.empty(truth.shape, dtype=torch.uint8)
-    for rows in bands(*truth.shape[:2]):
+    for rows in row_chunks(*truth.shape[:2]):
         error = (truth[rows].detach().float().cpu() - render[rows].detach().float().cpu()).abs().mean(dim=-1)
         picture[rows] = to_bytes(color_map(error, 0.0, ERROR_SCALE))
     return _with_scale(picture, top=ERROR_SCALE, bottom=0.0)

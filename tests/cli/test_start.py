@@ -82,7 +82,7 @@ def test_a_page_goes_without_photographs_and_says_so_unless_they_were_wished_for
     assert caplog.messages == ["what=page goes without photographs: nobody knows it"]
     with pytest.raises(UnknownScene):
         prepare._view(["ckpt=a", "photographs=True"])
-    assert prepare._export(["ckpt=a", "what=volume"]) == ["ckpt=a", "what=volume"]
+    assert prepare._export(["ckpt=a", "what=cameras"]) == ["ckpt=a", "what=cameras"]
     assert prepare._export(["ckpt=a"]) == ["ckpt=a"]
     assert prepare._export(["ckpt=a", "what=my_own"])[0] == "photographs=false"
 

@@ -5,10 +5,10 @@ import subprocess
 import sys
 
 import pytest
+from support.captures import write_npz
 from support.running import FAST, REPOSITORY, start_cold
 
 from nerf_lightning.cli import process
-from nerf_lightning.selftest.scene import write_npz
 
 PLANTED = ("torch", "numpy", "numba", "hydra", "lightning", "yaml", "psutil", "multiprocessing")
 SPAWN = """

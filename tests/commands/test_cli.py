@@ -14,7 +14,7 @@ from nerf_lightning.cli.main import find_commands
 def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkeypatch):
     result = nerf("--help")
     assert result.code == 0
-    for name in ("train", "eval", "render", "bench", "selftest"):
+    for name in ("train", "eval", "render", "selftest"):
         assert f"\n  {name}" in result.out
     assert nerf().out == result.out
     monkeypatch.setenv("COLUMNS", "80")
@@ -103,6 +103,7 @@ def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
 def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypatch, command, key):
     monkeypatch.chdir(tmp_path)
     said(nerf(command), f"nerf {command} needs a run, and outputs/ holds none")
+    said(nerf(command, "paths.root_dir=elsewhere"), f"nerf {command} needs a run, and elsewhere/ holds none")
     for age, run in enumerate(["outputs/sweeps/new/0_seed=0", "outputs/bricks/old"]):
         (tmp_path / run / "checkpoints").mkdir(parents=True)
         (tmp_path / run / "checkpoints" / "last.ckpt").touch()
@@ -117,7 +118,7 @@ def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf)
         in nerf("train", "optimizer.fused=true").err
     )
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
-    said(nerf("bench", "experiment=quickstart"), "nerf bench has no setting experiment. It belongs to training")
+    said(nerf("selftest", "experiment=quickstart"), "nerf selftest has no setting experiment. It belongs to training")
     said(nerf("train", "+experiment=quickstart"), "leave the + out. Type experiment=quickstart.")
     said(nerf("train", "trainer.accumulate_grad_batches=2"), "accumulate_grad_batches is data.batch_rays")
     said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")

@@ -29,7 +29,7 @@ def test_commands_groups_options_keys_and_values():
     assert completed("train", "trainer.max") == ["trainer.max_epochs=", "trainer.max_steps="]
     assert completed("train", "trainer.precision=b") == ["trainer.precision=bf16-mixed"]
     assert completed("train", "callbacks.nan") == ["callbacks.nan_guard."]
-    assert completed("export", "what=m") == ["what=mesh"]
+    assert completed("export", "what=i") == ["what=images"]
     assert completed("export", "optimizer") == []
     assert completed("help", "optimizer.l") == ["optimizer.lr"]
     assert completed("completion", "") == ["bash", "fish", "zsh"]

@@ -1,6 +1,5 @@
 """The fast path from the command line: resume, time budgets, refusals."""
 
-import json
 import signal
 import time
 
@@ -114,26 +113,3 @@ def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp
     result = nerf("render", f"ckpt={last}", "path.num_frames=2", f"paths.output_dir={tmp_path}/film")
     assert result.code == 0, result.err
     assert (tmp_path / "film/video.mp4").is_file()
-
-
-def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
-    threads, set_threads = [], torch.set_num_threads
-    monkeypatch.setattr("nerf_lightning.commands.bench.num_cores", lambda: 2)
-    monkeypatch.setattr(torch, "set_num_threads", lambda count: (threads.append(count), set_threads(count)))
-    result = nerf(
-        "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",
-        f"scene.cache_dir={tmp_path}/cache", *FAST_PATH, "rounds=1", "warmup_steps=20", "render_rays=64",
-        "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
-    )  # fmt: skip
-    assert result.code == 0, result.err
-    for name in (
-        "training rays/s",
-        "times plain",
-        "whole rays, loss and gradients, share of a step",
-    ):
-        assert name in result.out
-    assert {1, 2} <= set(threads)
-    measured = json.loads((tmp_path / "bench" / "bench.json").read_text())
-    assert measured["training on 2 threads, times one"]["median"] > 0
-    assert "share of a step that takes one thread alone" in measured
-    assert measured["training_flops_per_ray"] > 0

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 
 import pytest
@@ -46,6 +47,10 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     run = tmp_path / "run"
     assert f"page         {run}/page.html" in result.out
     assert 'href="./page.html"' in (run / "report.html").read_text()
+    last = result.out.splitlines()[-1]
+    assert re.fullmatch(rf"result +{run}/report.html: .*\b(\d+) of \1 photographs used. To improve it: .+\.", last), (
+        last
+    )
     assert (seen["quality"], seen["training"]) == ("small", False)
     assert len(seen["beside"].photographs.view_names) == 10
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)

@@ -34,14 +34,14 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert result.out.startswith("data.sample_budget=131072\n")
     assert "so that a step has about so many samples; null: they do not." in " ".join(result.out.split())
     assert "Takes int | null." in result.out
-    assert "model=fast_large 524288" in " ".join(result.out.split())
+    assert "model=fast_large 262144" in " ".join(result.out.split())
     result = nerf("train", "--help", "scene=colmap")
     assert result.out == nerf("help", "scene=colmap").out == nerf("help", "train", "scene=colmap").out
     assert "A COLMAP reconstruction" in result.out
     assert "scene.images=null\n" in result.out
     assert "scene.masks_keep=white\n" in result.out
     assert "Takes 'white' | 'black'." in result.out
-    assert "what.resolution=256" in nerf("help", "what.resolution").out
+    assert "what.resolution=null" in nerf("help", "what.resolution").out
     assert nerf("help", "export").out == nerf("export", "--help").out
     assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())

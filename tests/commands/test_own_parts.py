@@ -45,9 +45,8 @@ def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(ne
     measured = nerf("eval", f"ckpt={run}", f"trust={MODULE}", "evaluation.max_views=1", where)
     assert measured.code == 0, measured.err
     assert "dB" in measured.out
-    small = ("what=points", "what.num_points=50", "what.max_views=1")
-    points = nerf("export", f"ckpt={run}", *small, "trust=[support]", where)
-    assert points.code == 0, points.err
+    images = nerf("export", f"ckpt={run}", "what=images", "what.max_views=1", "trust=[support]", where)
+    assert images.code == 0, images.err
     said(nerf("render", f"ckpt={run}", "trust=no such module"), "trust=no such module", "a Python module")
 
 

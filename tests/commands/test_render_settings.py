@@ -19,7 +19,7 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.cli import main as cli
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf import bands
+from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
 from nerf_lightning.nerf.models.dense_level import DenseLevel
@@ -28,8 +28,9 @@ from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.video.film import bytes_per_pixel, film, require_room
 from nerf_lightning.video.frames import FilmFrames
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
-from nerf_lightning.video.paths.pan import LookAt
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, make_shots
 
@@ -155,11 +156,13 @@ def egg_in(to_user):
     return solid(distance, color=color, inside=INSIDE * unit_of(to_user))
 
 
-def test_models_with_other_working_frames_show_the_same_thing():
+def test_models_with_other_working_frames_show_the_same_thing(tmp_path):
     """A capture that was read otherwise has another working frame: the path is the first one's, seen from there."""
     user, first_frame = scene_record(ball_scene()), similarity(CYCLE.mT, torch.tensor([0.0, -1.0, 0.5]), 0.5)
     other_frame = similarity(CYCLE, torch.tensor([1.0, 2.0, 3.0]), 2.5)
-    path = LookAt(3, start=[4.0, 0.0, 1.0], end=[0.0, 4.0, 1.0], target=[0.0, 0.0, 0.0], width=24)
+    ends = ((4.0, 0.0, 1.0), (0.0, 4.0, 1.0))
+    write_keyframes(tmp_path / "keys.yaml", [Keyframe(end, look_at=(0.0, 0.0, 0.0)) for end in ends])
+    path = KeyframePath(str(tmp_path / "keys.yaml"), 3, width=24)
     subjects = [Subject(egg_in(each), in_frame(user, each), "white") for each in (first_frame, other_frame)]
     one, two = make_shots(subjects, path, 1 << 15)
     seen = poses_from_user(one.cameras.c2w.double(), torch.linalg.inv(first_frame))
@@ -285,7 +288,7 @@ def forward_facing(scene):
     ids=["default", "cut", "everything", "everything cut"],
 )
 def test_a_frame_takes_what_is_said(tmp_path, monkeypatch, settings, where, models):
-    monkeypatch.setattr(bands, "BAND_PIXELS", 1 << 12)  # frames worth refusing have many bands
+    monkeypatch.setattr(row_chunks, "CHUNK_PIXELS", 1 << 12)  # frames worth refusing have many chunks
     scene = where(scene_record(ball_scene()))
     subjects, path = [Subject(Blank(), scene, "white", "one")] * models, Orbit(1, width=SIDE)
     settings = replace(settings, form="frames")

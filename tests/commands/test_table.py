@@ -7,7 +7,6 @@ import statistics
 import pytest
 from support.measured_runs import PROTOCOL, leave_measured_run, ours
 from support.running import said
-from torch.utils.tensorboard import SummaryWriter
 
 
 def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
@@ -294,7 +293,6 @@ def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypat
         "model",
         "resolution",
         "PSNR",
-        "curve",
         "time",
         "steps",
         "some_long_setting",
@@ -304,21 +302,6 @@ def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypat
     ]
     assert set(head) <= {*whole, *(f"a{key}." for key in range(6))}
     assert f"a{head.count('some_long_setting')}.some_long_setting" in f"{lines[end]} a6.some_long_setting"
-
-
-def test_curves_stand_in_the_table_and_in_its_page(table, tmp_path):
-    run = leave_measured_run(tmp_path / "runs" / "a")
-    writer = SummaryWriter(str(run / "tensorboard"))
-    for step in range(10):
-        writer.add_scalar("PSNR/train_fine", 10.0 + step, 50 * step)
-    writer.close()
-    leave_measured_run(tmp_path / "runs" / "b", origin={"config": "b"})
-    result, rows = table("published=false")
-    assert "▁▁▂▃▄▅▆▇██" in result.out
-    assert "curve" not in rows[0], "CSV holds numbers"
-    page = (tmp_path / "out" / "table.html").read_text()
-    assert page.count("<polyline") == 1
-    assert "▁" not in table("published=false", "curves=false")[0].out
 
 
 @pytest.mark.slow

@@ -146,7 +146,7 @@ def test_every_export_builds(option):
     assert isinstance(build(composed("export", f"what={option}").what), Export)
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view", "selftest"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "export", "view", "selftest"])
 def test_every_command_composes(command):
     assert "trainer" in composed(command)
 

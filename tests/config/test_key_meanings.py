@@ -89,7 +89,7 @@ def texts_in(annotation):
 
 
 def test_every_group_is_one_that_a_file_may_choose_from_or_decidedly_none():
-    others = {"hydra", "paths", "budgets", "viewer", "what"}
+    others = {"hydra", "output", "budgets", "viewer", "what"}
     assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"}
     for group in others:
         assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group

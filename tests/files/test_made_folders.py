@@ -17,7 +17,6 @@ from nerf_lightning.files.made_folders import (
     make_new_folder,
     make_ours,
     remove_empty,
-    remove_new_folder,
 )
 
 links = pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
@@ -116,14 +115,11 @@ def test_a_scratch_folder_is_held_by_one_and_vanishes(tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_only_a_folder_that_this_process_made_is_removed_whole(tmp_path):
+def test_a_new_folder_is_nobody_elses_and_only_empty_ones_are_removed(tmp_path):
     (tmp_path / "theirs").mkdir()
     with pytest.raises(FileExistsError):
         make_new_folder(tmp_path / "theirs")
     make_new_folder(tmp_path / "a" / "new")
-    (tmp_path / "a" / "new" / "file").touch()
-    for folder in (tmp_path / "theirs", tmp_path / "a", tmp_path / "a" / "new"):
-        remove_new_folder(folder)
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "theirs"]
-    remove_empty(tmp_path / "none", tmp_path / "a")
+    (tmp_path / "theirs" / "file").touch()
+    remove_empty(tmp_path / "none", tmp_path / "theirs", tmp_path / "a" / "new", tmp_path / "a")
     assert [path.name for path in tmp_path.iterdir()] == ["theirs"]

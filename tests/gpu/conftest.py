@@ -6,11 +6,12 @@ the tests themselves can be tried; what only a GPU can be asked (synchronisation
 
 import os
 
+import numpy as np
 import pytest
 import torch
 
 from nerf_lightning.compute.devices import prepare_machine
-from nerf_lightning.selftest.scene import write_npz
+from nerf_lightning.selftest.scene import FOCAL, NUM_VIEWS, ball_scene
 
 CHOSEN = os.environ.get("NERF_LIGHTNING_GPU_TESTS_ON", "cuda")
 
@@ -40,7 +41,10 @@ def trainer(device):
 
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory):
-    """The ball as an npz file."""
-    path = tmp_path_factory.mktemp("capture") / "ball.npz"
-    write_npz(path)
+    """The ball in front of black as an npz file."""
+    path, scene = tmp_path_factory.mktemp("capture") / "ball.npz", ball_scene()
+    rgba = torch.stack([scene.pixels.view(view) for view in range(NUM_VIEWS)]).float() / 255
+    poses = torch.eye(4).repeat(NUM_VIEWS, 1, 1)
+    poses[:, :3] = scene.cameras.c2w
+    np.savez(path, images=(rgba[..., :3] * rgba[..., 3:]).numpy(), poses=poses.numpy(), focal=FOCAL)
     return path

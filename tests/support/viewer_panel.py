@@ -53,6 +53,8 @@ class Gui:
     def __getattr__(self, kind):
         def add(label, *values, initial_value=None, **options):
             value = values[-1] if values and initial_value is None else initial_value
+            if kind == "add_dropdown":
+                options["options"] = values[0]
             if kind == "add_slider":
                 options |= {"min": values[0], "max": values[1]}
             self.made[label] = Handle(value, label=label, content=label, **options)

@@ -76,6 +76,7 @@ def train(folder, name, accelerator, precision="32-true", steps=30, loss=None, d
 
         metrics.clear_all()
     counters = Counters()
+    (folder / "checkpoints").mkdir(parents=True)
     trainer = settings.build(folder, steps, [counters, *callbacks], [])
     trainer.fit(system, RayDataModule(scene, progress, 0, batch_rays=128, val_rays=120))
     return Run(system, counters, torch.stack([loss.cpu() for loss in counters.losses]))

@@ -49,7 +49,7 @@ def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):
     panel = Panel(tmp_path)
     monkeypatch.setattr(panel.session, "enter", lambda view: 1 / 0)
     for _ in range(3):
-        panel.press("ball_0")
+        panel.set("Look through", "0: ball_0")
     assert caplog.text.count("ZeroDivisionError") == 1
     assert "Traceback" not in caplog.text
 

@@ -82,7 +82,7 @@ def assemble_job(
             each.require_access()
     scene = build(asked.scene).read() if scene is None else scene
     post_training.require_film(scene)
-    config, picked = resolve_auto(asked, choices, overrides, scene)
+    config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type == "cuda", former)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
     run = assemble(config, picked, settings, scene)

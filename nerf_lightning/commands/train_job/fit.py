@@ -15,6 +15,8 @@ from nerf_lightning.commands.train_job.run_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.models.tiles import is_device_failure
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
@@ -27,6 +29,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
 
     Raises:
         SystemExit: a signal stopped the training, which was saved (128 + signal).
+        InputError: the GPU has failed.
     """
     former = folder.former
     _keep_end(job, folder)
@@ -36,7 +39,17 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
     if former is None:
         describe_run(trainer.loggers, job.config)
     checkpoint = None if former is None else former.checkpoint
-    trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
+    try:
+        trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
+    except RuntimeError as error:
+        if not is_device_failure(error):
+            raise
+        trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
+        raise InputError(
+            f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
+            f"{_what_is_left(folder)} If it fails again, nerf selftest tells whether the GPU computes right, and "
+            "trainer=cpu does without it."
+        ) from error
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
         log.info("%d steps in %s", steps, spoken(job.clock.seconds))
@@ -44,6 +57,12 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, resume_command(folder.path))
         raise SystemExit(128 + job.signals.received)
     return trainer
+
+
+def _what_is_left(folder: HeldFolder) -> str:
+    if not any((folder.path / "checkpoints").glob("*.ckpt")):
+        return "Nothing was saved yet: begin anew."
+    return f"Go on from the last checkpoint with: {resume_command(folder.path)}."
 
 
 def _keep_end(job: TrainJob, folder: HeldFolder) -> None:

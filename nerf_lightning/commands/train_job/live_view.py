@@ -17,7 +17,6 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.auth import names_of
-from nerf_lightning.viewer.film import FILM, end_film
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address
 from nerf_lightning.viewer.render_queue import RenderQueue
@@ -147,13 +146,12 @@ class LiveView(Callback):
             renderer.share = 1.0
             seconds = self.switch.pause_while(
                 page.queue.work_or_wait,
-                lambda: not page.is_empty or page.queue.turn_of(FILM) is not None,
+                lambda: not page.is_empty,
                 lambda: any(each.received is not None for each in signals),
             )
         finally:
             renderer.share = share
             system.train()
-        end_film(page.queue)
         for callback in callbacks:
             if isinstance(callback, Clocked):
                 callback.leave_out(seconds)

@@ -8,10 +8,10 @@ from nerf_lightning.compute.machine import free_memory, held_memory
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
-from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
@@ -28,8 +28,8 @@ SMALL = 0.1
 # A bound that needs no trial: bytes per ray, per pixel, and per point beside its features, each of which is kept a few
 # times over; what models take lies below the half of it.
 RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 128, 1_024, 6
-# And per pixel of a band.
-BAND_BYTES = 1_024
+# And per pixel of a chunk of rows.
+CHUNK_BYTES = 1_024
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ def at_most(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> 
     points = whole if settings.tile_points is None else threads_on(settings.device) * settings.tile_points
     features = 4 * sum(sum(matrix.shape) for matrix in matrices_of(model))
     largest = int((pixels.width * pixels.height).max())
-    picture = PIXEL_BYTES * largest + BAND_BYTES * min(largest, BAND_PIXELS)
+    picture = PIXEL_BYTES * largest + CHUNK_BYTES * min(largest, CHUNK_PIXELS)
     held = num_bytes(pixels) + 4 * _weights(step) + _compiled(step) + batch * RAY_BYTES + picture
     return int(held + KEPT * points * (features + POINT_BYTES))
 

@@ -1,7 +1,7 @@
 """How much memory a step and a picture take: a few small ones are tried and counted, and scaled up.
 
 What a step holds is linear in the rays of the batch and in those of a tile, and what a picture holds is linear in its
-pixels, where it has more than a band of them, and in the rays of a tile, so a few trials say all. A sum over the
+pixels, where it has more than a chunk of them, and in the rays of a tile, so a few trials say all. A sum over the
 outputs of all layers, with gradients and the optimizer's state, is 0.6 of that for `fast_small` and 2.1 for `nerf`.
 """
 
@@ -18,13 +18,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nerf_lightning.compute.machine import torch_threads
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
-from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.visualization.pictures import mosaic, panels
@@ -143,14 +143,14 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
         return peak_bytes(whole, device)
 
     def of_largest(work: Callable[[Picture], object]) -> float:
-        """Beyond two bands, bytes grow with the rows alone."""
-        if height <= 3 * band:
+        """Beyond two chunks, bytes grow with the rows alone."""
+        if height <= 3 * chunk:
             return float(held(height, work))
-        two, three = held(2 * band, work), held(3 * band, work)
-        return three + (three - two) * (height / band - 3)
+        two, three = held(2 * chunk, work), held(3 * chunk, work)
+        return three + (three - two) * (height / chunk - 3)
 
     width = min(TRIAL_SIDE, num_pixels)
-    height, band = -(-num_pixels // width), BAND_PIXELS // width
+    height, chunk = -(-num_pixels // width), CHUNK_PIXELS // width
     return int(max(of_largest(lambda picture: None) + tile_rays * per_ray, of_largest(_measured_and_shown)))
 
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -23,6 +24,7 @@ from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
+from nerf_lightning.video.shots import Subject, content_of
 
 ROWS = 15  # Of the profile: the actions that took longest, with all that they called
 WIDTH = 54  # Characters of an action's name
@@ -50,16 +52,17 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(f"report       {target}", *_result(job, psnr))
+        say(_result(job, target, psnr))
 
 
-def _result(job: TrainJob, psnr: float | None) -> list[str]:
-    """Return what came out of the photographs, and what would improve it most."""
-    used = len(job.scene.view_names)
+def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
+    """Return the last line: the page, what came out of the photographs, and what would improve it most."""
+    used, seconds = len(job.scene.view_names), job.config.budget.seconds
+    total = used + len(job.scene.left_out)
     quality = "" if psnr is None else f"{psnr:.1f} dB on photographs held out, "
-    lines = [f"result       {quality}{used} of {used + len(job.scene.left_out)} photographs used"]
-    cure = advice(job.checks or ())
-    return lines if cure is None else [*lines, f"to improve   {cure}"]
+    longer = "train longer" if seconds is None else f"budget.seconds={2 * seconds:g} trains twice as long"
+    cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
+    return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
 
 
 def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
@@ -70,7 +73,9 @@ def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
         model = load_model(checkpoint).to(job.settings.device).eval()
         path = job.config.path.copy()
         path.update(PATH)
-        what.beside = beside(checkpoint, as_trained(job.scene, checkpoint), build(path))
+        subject = Subject(model, checkpoint.scene, checkpoint.scene.background)
+        content = partial(content_of, subject, job.settings.inference_tile_points)
+        what.beside = beside(checkpoint, as_trained(job.scene, checkpoint), build(path), content)
         with torch.no_grad():
             written = what.export(model, checkpoint.scene, folder, job.settings.inference_tile_points)
         say(*(f"page         {file}" for file in written))

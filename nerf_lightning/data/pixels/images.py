@@ -23,7 +23,7 @@ from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, HEIC_KIN
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", *HEIC_ENDINGS)
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
@@ -132,7 +132,7 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
         rgba = np.empty((image.height, image.width, 4), np.uint8)
-        for rows in bands(*rgba.shape[:2]):  # several copies of the whole would be held at once
+        for rows in row_chunks(*rgba.shape[:2]):  # several copies of the whole would be held at once
             part = image.crop((0, rows.start, image.width, rows.stop))
             if part.mode in GREY_16:
                 part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))

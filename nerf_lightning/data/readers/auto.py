@@ -1,11 +1,15 @@
 """A capture of whatever format: the files in its folder, or in one just below or above, tell which."""
 
+import importlib
 import inspect
 import logging
 import os
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import contents
@@ -14,23 +18,27 @@ from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
-from nerf_lightning.data.readers.metashape import MetashapeReader
-from nerf_lightning.data.readers.neus import NeusReader
-from nerf_lightning.data.readers.polycam import PolycamReader
-from nerf_lightning.data.readers.text_poses import NerfPlusPlusReader, NsvfReader
 from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
-READERS: tuple[type[Reader], ...] = (
-    *(BlenderReader, TransformsReader, ColmapReader, LlffReader),
-    *(PolycamReader, NeusReader, NsvfReader, NerfPlusPlusReader, MetashapeReader),
-)
+FIRST: tuple[type[Reader], ...] = (BlenderReader, TransformsReader, ColmapReader, LlffReader)
 """Where a folder has the files of several, the first says more: a COLMAP model has lenses and points, which
 poses_bounds.npy beside it lacks."""
 
 log = logging.getLogger(__name__)
+
+
+@cache
+def readers() -> tuple[type[Reader], ...]:
+    """Return the readers whose formats are known by files: `FIRST`, then the others that yamls in `scene/` name."""
+    texts = (conf_file(f"scene/{name}").read_text(encoding="utf-8") for name in option_names("scene"))
+    targets = (str(yaml.safe_load(text)["_target_"]).rpartition(".") for text in texts)
+    classes = (getattr(importlib.import_module(module), name) for module, _, name in targets)
+    found = [each for each in classes if "found_in" in vars(each) and each not in FIRST]
+    return (*FIRST, *dict.fromkeys(found))
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ class AutoReader(CaptureReader):
     @staticmethod
     def known_format(folder: Path) -> Known | None:
         """Return what a folder itself is; None for no known format."""
-        for reader in READERS:
+        for reader in readers():
             if (file := reader.found_in(folder)) is not None:
                 return Known(folder, file, reader)
         return None
@@ -116,7 +124,7 @@ class AutoReader(CaptureReader):
         require_one([known.folder for known in found], self.root)
         if found:
             return found[0]
-        formats = listed((Known(folder, "", reader).scene for reader in READERS), len(READERS))
+        formats = listed((Known(folder, "", reader).scene for reader in readers()), len(readers()))
         raise InputError(
             f"{self.root} holds no capture of a format that is known here ({formats}): it holds {contents(folder)}."
             f"{self._hint()} If these are photographs whose cameras nobody knows yet, use scene=photos."
@@ -125,11 +133,10 @@ class AutoReader(CaptureReader):
     def _named_file(self) -> Known | None:
         """Return the reader of the very file that the user has named, where that is one of a capture."""
         path = Path(self.root).expanduser()
-        if not os.path.isfile(path) or path.suffix.lower() not in (".json", ".xml"):
+        fitting = [reader for reader in readers() if path.suffix.lower() in reader.named_by]
+        if not fitting or not os.path.isfile(path):
             return None
-        reader: type[Reader] = MetashapeReader if path.suffix.lower() == ".xml" else TransformsReader
-        if BlenderReader.found_in(path.parent) == path.name:
-            reader = BlenderReader
+        reader = next((each for each in fitting if each.found_in(path.parent) == path.name), fitting[-1])
         return Known(self.folder(), path.name, reader)
 
     def _hint(self) -> str:

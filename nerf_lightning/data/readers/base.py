@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -17,6 +18,9 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Sce
 
 class Reader(ABC):
     """Read a capture. The constructor only keeps its arguments; every file access happens in `read`."""
+
+    named_by: ClassVar[tuple[str, ...]] = ()
+    """Endings of files of this format that `scene=auto scene.root=FILE` may name."""
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:

@@ -51,6 +51,8 @@ class BlenderReader(GivenFrameReader):
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
     """
 
+    named_by = (".json",)
+
     root: str
     skip: Mapping[str, int] | None = None
     metres_per_unit: float | None = None

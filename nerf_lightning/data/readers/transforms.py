@@ -47,6 +47,8 @@ class TransformsReader(CaptureReader):
         depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
     """
 
+    named_by = (".json",)
+
     name: str = "transforms"
     file: str | None = None
     depth_unit: float = 1e-3
@@ -126,7 +128,12 @@ class TransformsReader(CaptureReader):
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
-                "%s: of %d files (%s) %d are not there: %s", path, len(wanted), key, len(absent), listed(absent, 3)
+                "%s: of %d files (%s) %d are not there, or no pictures: %s",
+                path,
+                len(wanted),
+                key,
+                len(absent),
+                listed(absent, 3),
             )
         return [None if name is None else files.get(name) for name in names]
 

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerf_lightning.export.baking.marcher import MarchedRays, Marcher
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
@@ -16,6 +15,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture, view_rays
 from nerf_lightning.nerf.psnr import picture_psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
 
 
@@ -68,7 +68,7 @@ def measured_cost(
     for number, view in enumerate(views):
         own = render_picture(model, rays_of, view, scene.background, tile_points).rgb.clamp(0, 1)
         page = torch.empty_like(own)
-        for rows in bands(*page.shape[:2]):
+        for rows in row_chunks(*page.shape[:2]):
             marched = marcher.render(view_rays(rays_of, all_pixels(scene.cameras, view)[rows])[0])
             page[rows] = over(marched, scene.background).clamp(0, 1)
             samples.append((len(page[rows]) / len(page) / len(views), marched.num_densities, marched.num_colors))

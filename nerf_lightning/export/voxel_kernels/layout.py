@@ -46,9 +46,9 @@ class Wanted:
     """The colours of the background."""
 
 
-def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.") -> ModuleType:
-    """Return a module of this folder, which must compile here: without these kernels the work would take hours."""
-    name = f"{ROOM}.{module}"
+def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.", room: str = ROOM) -> ModuleType:
+    """Return a module of this folder (or of `room`), which must compile: without its kernels the work takes hours."""
+    name = f"{room}.{module}"
     found = backend(name)
     if found is None:
         raise InputError(f"{asked_by} needs numba, which cannot be used here: {why_not(name)}. {cure}")

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.checkpoints.quantization import NumberType, quantize_rows, quantize_switches
+from nerf_lightning.extensions.pruning.quantize import NumberType, quantize_rows, quantize_switches
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
@@ -29,7 +29,7 @@ AT_ONCE = 1 << 18
 
 
 def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[str, Any]:
-    """Return a model's weights that are not kept as they are, as `checkpoints.quantization` has them.
+    """Return a model's weights that are not kept as they are, as `quantize` writes them.
 
     Args:
         model: with its weights, on the CPU.

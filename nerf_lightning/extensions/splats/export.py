@@ -14,7 +14,6 @@ from torch import Tensor
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.export.mesh_files import y_up
 from nerf_lightning.extensions.splats.files import SplatFormat, moved, require_library, save_splats
 from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
@@ -24,7 +23,7 @@ from nerf_lightning.extensions.splats.views import View, color_behind, photograp
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import directions_to_user
+from nerf_lightning.nerf.geometry.frames import directions_to_user, y_up
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
@@ -170,7 +169,7 @@ def extent(cameras: Cameras) -> float:
 def to_gltf(record: SceneRecord) -> Float[Tensor, "4 4"]:
     """Return what takes the capture's frame to glTF's, where y is up and a unit is a metre, as far as that is known."""
     up = directions_to_user(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), record.to_user.double())
-    matrix = torch.from_numpy(y_up(up.numpy()))
+    matrix = y_up(up)
     matrix[:3] *= record.metres_per_unit or 1.0
     return matrix
 

@@ -54,3 +54,18 @@ class Correction(Part, ABC):
             rgb: sRGB-encoded, composited; in [0, 1] or somewhat beyond. So is what comes out, without a clamp.
             pixels: where in which photograph each colour stands.
         """
+
+
+class NoCorrection(Correction):
+    """Leave every colour as it is: photographs show what there is."""
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take any scene."""
+
+    def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
+        """Return the rendering itself."""
+        return rendering
+
+    def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
+        """Return the colours themselves."""
+        return rgb

@@ -98,6 +98,17 @@ def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.eye(3).to(up) + skew + skew @ skew / (1.0 + cosine)
 
 
+def y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """Return the rotation that takes `up` (unit) to +y, as glTF has it, and what a frame with z up calls x to x.
+
+    >>> (y_up(torch.tensor([0.0, 0.0, 1.0])) @ torch.tensor([1.0, 2.0, 3.0, 1.0])).tolist()
+    [1.0, 3.0, -2.0, 1.0]
+    """
+    turned = torch.eye(4).to(up)
+    turned[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).to(up) @ upright_rotation(up)
+    return turned
+
+
 def gaps_around(azimuth: Float[Tensor, "views"]) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
     """Return azimuths in degrees in order, and the way from each to the next, the last one's to the first.
 

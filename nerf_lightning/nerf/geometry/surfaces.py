@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.row_chunks import row_chunks
 
 _SEEN = 1e-3
 """Opacity below which a ray met nothing: what is left of its depth is rounding."""
@@ -44,7 +44,7 @@ def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor,
     pinhole sees, so no pose is needed. The picture must be at least two pixels high and wide.
     """
     normals, height = torch.empty_like(points), points.shape[0]
-    for rows in bands(*points.shape[:2]):
+    for rows in row_chunks(*points.shape[:2]):
         top, bottom = max(0, rows.start - REACH), min(height, rows.stop + REACH)
         normals[rows] = _normals(points[top:bottom])[rows.start - top : rows.stop - top]
     return normals

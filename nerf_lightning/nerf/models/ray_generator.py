@@ -12,9 +12,8 @@ from nerf_lightning.nerf.geometry.ndc import share_at_distance
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.refinements.base import Refinement
+from nerf_lightning.nerf.refinements.base import NoRefinement, Refinement
 from nerf_lightning.nerf.refinements.displacements import align_untrained_cameras
-from nerf_lightning.nerf.refinements.none import NoRefinement
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
@@ -20,6 +19,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
@@ -135,7 +135,7 @@ def picture_surface(
     cameras = rays_of.cameras
     depth, opacity = picture.depth.flatten(), picture.opacity.flatten()
     surface, points = torch.empty_like(depth), torch.empty(len(depth), 3)
-    for part in bands(len(depth), 1):
+    for part in row_chunks(len(depth), 1):
         rays, straight = view_rays(rays_of, pixels_between(cameras, view, part), clip)
         bent = cameras.ndc is not None
         surface[part] = depth[part] if bent else surface_depth(depth[part], opacity[part], rays.far)

@@ -23,3 +23,11 @@ class Refinement(Part, ABC):
     def moves(self) -> bool:
         """Tell whether there is anything to learn."""
         return next(self.parameters(), None) is not None
+
+
+class NoRefinement(Refinement):
+    """Leave the cameras as they were read."""
+
+    def forward(self, cameras: Cameras) -> Cameras:
+        """Return the same cameras."""
+        return cameras

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.scene import DRAWN, UNSURE, Background, Scene
 
 LEAST_OPACITY = 1e-2
@@ -90,6 +90,6 @@ def photograph(scene: Scene, view: int, background: Background) -> Float[Tensor,
     behind = background_colors(background, 1, torch.device("cpu"), random=None)
     rgba = scene.pixels.view(view)
     shown = torch.empty(*rgba.shape[:2], 3)
-    for rows in bands(*rgba.shape[:2]):
+    for rows in row_chunks(*rgba.shape[:2]):
         shown[rows] = blend(rgba[rows].float() / 255.0, behind)
     return shown

@@ -6,7 +6,7 @@ files; `PathFrame.to_user` says how the working frame lies in it.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 
 import torch
@@ -24,6 +24,8 @@ from nerf_lightning.nerf.types.scene import Cameras
 
 NDC_FOCUS = 5.0  # What a camera in front of a scene looks at, in units of the near plane's distance.
 LARGEST = 1e15  # Larger numbers overflow when they are squared.
+
+Content = Callable[[], Float[Tensor, "points 3"]]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,10 @@ class PathFrame:
     """What the photographs are called, in the order of `poses`."""
     forward_facing: bool = False
     """Whether all photographs look the same way, into normalised device coordinates."""
+    bounded: bool = False
+    """Whether nothing lies behind the content, so that it may be looked at from any distance."""
+    content: Content = lambda: torch.zeros(0, 3)
+    """Returns points of what the photographs show in their middle; none where no model is known."""
 
     @property
     def unit(self) -> float:

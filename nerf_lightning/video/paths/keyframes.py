@@ -65,8 +65,8 @@ def read_keyframes(path: Path) -> list[Keyframe]:
         raise InputError(f"{path} holds a number that cannot be read ({error}). {CURE}") from error
     if len(keyframes) < 2:
         raise InputError(
-            f"{path} has {len(keyframes)} keyframe(s), and a path needs two. Add more, or use path=look_at for a "
-            "camera that stays."
+            f"{path} has {len(keyframes)} keyframe(s), and a path needs two. Add more; for a camera that stays, give "
+            "the same one twice."
         )
     _check_times(path, keyframes)
     return keyframes

@@ -30,20 +30,20 @@ class PhotographPath(CameraPath):
         """Return the cameras between the photographs."""
         count = len(around.poses)
         chosen = list(range(count)) if self.views is None else self.views
-        numbers = find_views("views", chosen, around.view_names, count)
+        numbers = find_views(chosen, around.view_names, count)
         if len(numbers) < 2:
             named = f"path.views={self.views} names {len(numbers)} photograph(s)"
-            raise InputError(f"{named}, and a path needs two. Name more, or use path=pan for a camera that stays.")
+            raise InputError(f"{named}, and a path needs two. Name more; for a camera that stays, name one twice.")
         keys = around.poses[numbers]
         knots = even_speed(keys, around.radius, self.closed)
         at = frame_times(knots, self.num_frames, self.closed)
         return self.pinholes(poses_along(knots, keys, at), around)
 
 
-def find_views(setting: str, chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:
+def find_views(chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:
     """Return the numbers of photographs that are given by name, pattern or number.
 
-    >>> find_views("views", [2, "b", "*"], ["a", "b", "c"], 3)
+    >>> find_views([2, "b", "*"], ["a", "b", "c"], 3)
     [2, 1, 0, 1, 2]
     """
     found: list[int] = []
@@ -56,7 +56,7 @@ def find_views(setting: str, chosen: Sequence[str | int], names: Sequence[str], 
         if not numbers:
             near = difflib.get_close_matches(str(each), names, n=3) or list(names[:3])
             raise InputError(
-                f"path.{setting}: the capture has no photograph {each}. It has {count}, numbered from 0"
+                f"path.views: the capture has no photograph {each}. It has {count}, numbered from 0"
                 + (f", with names like {', '.join(near)}." if near else ".")
             )
         found += numbers

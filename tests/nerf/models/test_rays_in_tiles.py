@@ -8,7 +8,7 @@ from support.scenes import LENSES, ball_scene, tiny_model
 
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.evaluation.metrics import image_metrics
-from nerf_lightning.nerf import bands
+from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import all_pixels, resized
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
@@ -110,7 +110,7 @@ def test_no_more_rays_than_a_tile_has_are_made_at_once(clip, per_side, monkeypat
 
 
 def test_what_is_measured_and_shown_of_a_picture_takes_no_more_than_copies_of_it(monkeypatch):
-    monkeypatch.setattr(bands, "BAND_PIXELS", LARGE_TILE)
+    monkeypatch.setattr(row_chunks, "CHUNK_PIXELS", LARGE_TILE)
     rgb = torch.rand(HEIGHT, WIDTH, 3)
     picture, truth = Picture(rgb, 2 + rgb[..., 0], rgb[..., 1]), rgb.flip(0)
     rgba = torch.zeros(WIDTH * HEIGHT, 4, dtype=torch.uint8)
@@ -133,8 +133,8 @@ def test_metrics_are_those_of_the_whole_picture(monkeypatch):
     for mask in (None, kept):
         whole = image_metrics(render, truth, mask)
         with monkeypatch.context() as patch:
-            patch.setattr(bands, "BAND_PIXELS", 7 * 40)
+            patch.setattr(row_chunks, "CHUNK_PIXELS", 7 * 40)
             assert image_metrics(render, truth, mask) == pytest.approx(whole, rel=1e-6)
     normals = normals_from_depth(render)
-    monkeypatch.setattr(bands, "BAND_PIXELS", 3 * 40)
+    monkeypatch.setattr(row_chunks, "CHUNK_PIXELS", 3 * 40)
     assert torch.equal(normals_from_depth(render), normals)

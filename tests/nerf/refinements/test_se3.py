@@ -24,8 +24,8 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.refinements.base import NoRefinement
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
-from nerf_lightning.nerf.refinements.none import NoRefinement
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points

@@ -18,7 +18,7 @@ from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.video.paths.orbit import Orbit
-from nerf_lightning.video.paths.pan import Pan
+from nerf_lightning.video.paths.photograph_path import PhotographPath
 from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.shots import in_front_of_near_plane
 
@@ -29,7 +29,7 @@ def elsewhere():
     return replace(frame(), to_user=similarity(turn, torch.tensor([5.0, -3.0, 2.0], dtype=torch.float64), 3.0))
 
 
-@pytest.mark.parametrize("path", [Orbit(120, fps=12), Spiral(90, fps=10), Pan(40, view=1)])
+@pytest.mark.parametrize("path", [Orbit(120, fps=12), Spiral(90, fps=10)])
 def test_the_curve_through_the_keyframes_of_a_path_is_the_path(path):
     around = elsewhere()
     found = as_keyframes(path, around)
@@ -47,7 +47,7 @@ def test_a_circle_ends_where_it_began():
     found = as_keyframes(Orbit(60, fps=12), frame())
     assert found[0].position == found[-1].position
     assert found[-1].time == pytest.approx(5.0)
-    assert as_keyframes(Pan(60, view=1), frame())[-1].time == pytest.approx(59 / 30)
+    assert as_keyframes(PhotographPath(60), frame())[-1].time == pytest.approx(59 / 30)
 
 
 def test_keyframes_of_a_file_stay_as_they_are(tmp_path):

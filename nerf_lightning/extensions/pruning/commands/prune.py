@@ -8,7 +8,6 @@ from omegaconf import DictConfig
 
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import KEY
-from nerf_lightning.checkpoints.quantization import NumberType
 from nerf_lightning.checkpoints.reading import LAST, Checkpoint, read_content
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.config.instantiate import require_fitting
@@ -18,6 +17,7 @@ from nerf_lightning.config.overrides import to_type
 from nerf_lightning.extensions.pruning.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.extensions.pruning.narrower_model import shapes_of, widths_of, with_widths
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
+from nerf_lightning.extensions.pruning.quantize import NumberType
 from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights
 from nerf_lightning.files.made_folders import below, make_folder
 from nerf_lightning.messages.console import say

@@ -34,9 +34,9 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     words_of,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import LANES, bytes_of, round_vector
+from nerf_lightning.nerf.kernels.render.compositing import BACK, COLOR, LIGHT, SHARE, WEIGHT, absorb, new_rooms, shade
 from nerf_lightning.nerf.kernels.render.cpu import arrays_of, network
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.quadrature import BACK, COLOR, LIGHT, SHARE, WEIGHT, absorb, new_rooms, shade
 from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle

@@ -33,6 +33,16 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     words_of,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
+from nerf_lightning.nerf.kernels.render.compositing import (
+    BACK,
+    COLOR,
+    DISTANCE,
+    LIGHT,
+    WEIGHT,
+    absorb,
+    new_rooms,
+    shade,
+)
 from nerf_lightning.nerf.kernels.render.cpu import (
     along,
     arrays_of,
@@ -44,16 +54,6 @@ from nerf_lightning.nerf.kernels.render.cpu import (
     trial_arguments,
 )
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.quadrature import (
-    BACK,
-    COLOR,
-    DISTANCE,
-    LIGHT,
-    WEIGHT,
-    absorb,
-    new_rooms,
-    shade,
-)
 from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle

@@ -1,0 +1,150 @@
+"""Measure training and rendering speed against plain float32 and against the machine's own matrix rate.
+
+Medians of ratios: machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are
+compared round by round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32
+without tiles, the machine's matrix product, making a batch, the configured step with batches from the loader, and
+rendering.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from omegaconf import DictConfig
+from rich.progress import track
+from rich.table import Table
+
+from nerf_lightning.compute.cores import num_cores
+from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.extensions.bench.kernels import compared_kernels
+from nerf_lightning.extensions.bench.prepared import Bench, prepare
+from nerf_lightning.extensions.bench.stages import (
+    MATRIX_FLOPS,
+    LoadedSteps,
+    flops_per_ray,
+    multiplication,
+    stage_seconds,
+)
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
+
+Work = Callable[[], Any]
+Rows = dict[str, Float[np.ndarray, "rounds"]]
+
+
+def run(config: DictConfig) -> float:
+    """Measure, print a table, write bench.json; return training rays per second."""
+    bench = prepare(config, build(config.scene).read())
+    for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
+        bench.take_step()
+    bench.train(config.steps)
+    peak = peak_memory()  # before the whole batches of the plain kinds
+    rows, flops = _rows_of_steps(bench, config)
+    if config.kernels:
+        rows |= _rows_of_kernels(bench.settings.device, config.rounds)
+    result: dict[str, Any] = {
+        name: {"median": float(np.median(values)), "min": float(values.min()), "max": float(values.max())}
+        for name, values in rows.items()
+    }
+    result |= {
+        "machine": bench.settings.describe(),
+        "tile_points": bench.settings.tile_points,
+        "batch_rays": bench.batch.num_rays,
+        "training_flops_per_ray": flops,
+        "peak_memory_gigabytes": peak,
+        "rounds": config.rounds,
+    }
+    _print_table(result)
+    folder = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
+    write_json(folder / "bench.json", result)
+    say(f"written to {folder / 'bench.json'}")
+    return float(result["training rays/s"]["median"])
+
+
+def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:
+    """Return the seconds of each kind."""
+    seconds: dict[str, list[float]] = {name: [] for name in kinds}
+    for number in range(rounds + 1):
+        for name, work in kinds.items():
+            taken = seconds_of(work)
+            if number:  # the first round warms up
+                seconds[name].append(taken)
+    return {name: np.array(values) for name, values in seconds.items()}
+
+
+def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
+    """Return what is said of training and rendering, and the operations of training per ray."""
+    steps, render_rays = config.steps, config.render_rays
+    loaded_steps = LoadedSteps(bench.batches, bench.train_on, steps)
+    threads = [2**k for k in range(num_cores().bit_length())] if config.scaling else []
+    kinds: dict[str, Work] = {
+        "matrix": multiplication(bench.settings),
+        "train": partial(bench.train, steps),
+        "train_plain": partial(bench.train, steps, plain=True),
+        "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
+        "loaded": loaded_steps,
+        "render": partial(bench.render, render_rays),
+        "render_plain": partial(bench.render, render_rays, plain=True),
+        **{f"train on {count}": partial(_on_threads, count, partial(bench.train, steps)) for count in threads},
+    }
+    seconds = _interleaved(kinds, config.rounds)
+    train, wait = seconds["train"], np.array(loaded_steps.waits[1:])
+    flops, train_rays = flops_per_ray(bench.step, bench.batch), bench.batch.num_rays * steps
+    rate, matrix_rate = train_rays * flops / train, MATRIX_FLOPS / seconds["matrix"]
+    rows = {
+        "training rays/s": train_rays / train,
+        "training, times plain float32": seconds["train_plain"] / train,
+        "training GFLOP/s": rate / 1e9,
+        "matrix GFLOP/s": matrix_rate / 1e9,
+        "training, share of the matrix rate": rate / matrix_rate,
+        "making a batch, milliseconds": 1e3 * seconds["load"],
+        "waiting for a batch, milliseconds": 1e3 * wait,
+        "waiting, share of a step": wait * steps / train,
+        "rendering rays/s": render_rays / seconds["render"],
+        "rendering, times plain float32": seconds["render_plain"] / seconds["render"],
+    }
+    stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
+    for name in stages[0]:
+        rows[f"{name}, share of a step"] = np.array([each[name] for each in stages]) * steps / train
+    for count in threads:
+        label = "training on 1 thread, milliseconds" if count == 1 else f"training on {count} threads, times one"
+        one, more = seconds["train on 1"], seconds[f"train on {count}"]
+        rows[label] = 1e3 * one / steps if count == 1 else one / more
+    if len(threads) > 1:  # Amdahl's law: t_n / t_1 = s + (1 - s) / n
+        count, share = threads[-1], seconds[f"train on {threads[-1]}"] / seconds["train on 1"]
+        rows["share of a step that takes one thread alone"] = ((count * share - 1.0) / (count - 1.0)).clip(0.0, 1.0)
+    return rows, flops
+
+
+def _on_threads(count: int, work: Work) -> None:
+    with torch_threads(count):
+        work()
+
+
+def _rows_of_kernels(device: torch.device, rounds: int) -> Rows:
+    """Return how long our kernels take, and how many times longer torch takes."""
+    rows = {}
+    for name, works in compared_kernels(device).items():
+        seconds = _interleaved(works, rounds)
+        ours = seconds.pop("ours")
+        rows[f"{name}, milliseconds"] = 1e3 * ours
+        rows |= {f"{name}, times torch {other}": theirs / ours for other, theirs in seconds.items()}
+    return rows
+
+
+def _print_table(result: dict[str, Any]) -> None:
+    """Print a row for each quantity."""
+    table = Table(title=f"nerf bench: {result['machine']}, tiles of {result['tile_points']} points")
+    for column in ("", "median", "min", "max"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, value in result.items():
+        if isinstance(value, dict):
+            table.add_row(name, *(f"{value[key]:,.3g}" if value[key] < 100 else f"{value[key]:,.0f}" for key in value))
+    table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
+    StdoutConsole(width=100).print(table)

@@ -1,0 +1,33 @@
+"""`nerf bench`: what it measures, and where it writes it."""
+
+import json
+
+import torch
+from support.running import FAST_PATH, said
+
+
+def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
+    threads, set_threads = [], torch.set_num_threads
+    monkeypatch.setattr("nerf_lightning.extensions.bench.commands.bench.num_cores", lambda: 2)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: (threads.append(count), set_threads(count)))
+    result = nerf(
+        "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",
+        f"scene.cache_dir={tmp_path}/cache", *FAST_PATH, "rounds=1", "warmup_steps=20", "render_rays=64",
+        "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    for name in (
+        "training rays/s",
+        "times plain",
+        "whole rays, loss and gradients, share of a step",
+    ):
+        assert name in result.out
+    assert {1, 2} <= set(threads)
+    measured = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    assert measured["training on 2 threads, times one"]["median"] > 0
+    assert "share of a step that takes one thread alone" in measured
+    assert measured["training_flops_per_ray"] > 0
+
+
+def test_a_group_of_training_is_told_where_it_belongs(nerf):
+    said(nerf("bench", "experiment=quickstart"), "nerf bench has no setting experiment. It belongs to training")

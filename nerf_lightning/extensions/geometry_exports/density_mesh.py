@@ -1,0 +1,135 @@
+"""The surface where the density crosses a level, as a mesh: closed, the insides of things included.
+
+Marching cubes (Lewiner et al. 2003) are scikit-image's; what floats is removed.
+"""
+
+import logging
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from nerf_lightning.export.density_grid import Lattice, Report, sample_density
+from nerf_lightning.export.visibility import num_agreeing, see
+from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
+from nerf_lightning.extensions.geometry_exports.surface import surface_level
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
+
+BYTES_PER_POINT = 8  # The density's grid, and as much again for the mesh.
+RATIO = 10.0  # So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
+
+log = logging.getLogger(__name__)
+
+
+def mesh_of_density(
+    model: Model, record: SceneRecord, lattice: Lattice, threshold: float | None, tile_points: int, report: Report
+) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+    """Return vertices (scene frame) and faces of the surface where the density is `threshold` per scene unit.
+
+    Without a threshold, that is where rendering sees it (`surface_level`).
+    """
+    density = sample_density(model, lattice, tile_points, report)
+    if record.space == "bounded":
+        # Nothing lies outside of its box: the surface is closed there.
+        for axis in range(3):
+            sides = np.moveaxis(density, axis, 0)
+            sides[0] = sides[-1] = 0.0
+    level = _level(model, record, density, threshold, tile_points)
+    # Densities grow by factors, and so the logarithm of their ratio to the level is straight.
+    density /= level
+    np.clip(density, 1.0 / RATIO, RATIO, out=density)
+    np.log(density, out=density)
+    vertices, faces = marching_cubes(density, 0.0, report)
+    log.info("the surface is where the density is %.4g", level)
+    return lattice.to_scene(vertices), faces
+
+
+def _level(
+    model: Model, record: SceneRecord, density: Float[ndarray, "x y z"], threshold: float | None, tile_points: int
+) -> float:
+    level = threshold or surface_level(model, record, tile_points)
+    lowest, highest = float(density.min()), float(density.max())
+    if level is not None and lowest < level < highest:
+        return level
+    found = f"the densities of its box go from {lowest:.3g} to {highest:.3g} per scene unit"
+    if level is None:
+        missing, seen = "", ", and no training view sees anything opaque there"
+    else:
+        missing, seen = f" where the density is {level:.3g}", ""
+    raise InputError(
+        f"There is no surface in {record.name}{missing}: {found}{seen}. Train longer, or give what.threshold=DENSITY "
+        "between the two."
+    )
+
+
+def marching_cubes(
+    density: Float[ndarray, "x y z"], level: float, report: Report
+) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside."""
+    measure = require_library("skimage.measure")
+    if not density.min() < level < density.max():
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    vertices, faces, _, _ = measure.marching_cubes(density, level)
+    report("surface", 1.0)
+    # scikit-image's run clockwise where what is dense lies inside.
+    return vertices, np.ascontiguousarray(faces[:, ::-1])
+
+
+def without_floaters(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], least_share: float
+) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"], int]:
+    """Return the connected parts that have at least this share of the largest one's faces, and how many have not."""
+    size, edges = len(vertices), np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = coo_array((np.ones(len(edges), bool), edges.T), shape=(size, size))
+    _, part_of_vertex = connected_components(links, directed=False)
+    part = part_of_vertex[faces[:, 0]]
+    num_faces = np.bincount(part)
+    large = num_faces >= least_share * num_faces.max()
+    faces = faces[large[part]]
+    used = np.unique(faces)
+    place = np.full(size, -1, np.int32)
+    place[used] = np.arange(len(used))
+    return vertices[used], place[faces], int(((num_faces > 0) & ~large).sum())
+
+
+VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.
+TOLERANCE = 0.015  # A vertex is seen where a view's depth is its distance, up to this share of it.
+OPAQUE = 0.5  # Pixels that stop less light see no surface.
+RINGS = 2  # The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
+
+
+def seen_faces(
+    model: Model,
+    record: SceneRecord,
+    vertices: Float[ndarray, "vertices 3"],
+    faces: Int[ndarray, "faces 3"],
+    tile_points: int,
+    report: Report,
+) -> Int[ndarray, "seen 3"]:
+    """Return the faces that a training view sees, or whose neighbours it does, of which there must be some."""
+    cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
+    points = torch.from_numpy(vertices).float()
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for number, view in enumerate(views):
+        picture = see(model, record, cameras, view, tile_points)
+        depth = torch.where(picture.opacity > OPAQUE, picture.depth, torch.inf)
+        seen |= num_agreeing(points, cameras, {view: depth}, [view], TOLERANCE) > 0
+        report("views", (number + 1) / len(views))
+    known = seen.numpy()
+    kept = known[faces].any(axis=1)
+    for _ in range(RINGS):
+        known[faces[kept]] = True
+        kept = known[faces].any(axis=1)
+    if not kept.any():
+        raise InputError(
+            "No training view sees any part of the mesh as its surface: what.threshold is far from the density that "
+            "the views end in. Give another, or what.threshold=null, or what.seen_only=false."
+        )
+    return np.ascontiguousarray(faces[kept])

@@ -1,0 +1,142 @@
+"""The surface that the views see, as a mesh: their rendered depth, fused to one truncated signed distance."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.export.density_grid import Lattice, Report
+from nerf_lightning.export.voxel_kernels.layout import kernels
+from nerf_lightning.extensions.geometry_exports.density_mesh import marching_cubes
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, resized
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.tiles import weighted_renderings
+from nerf_lightning.nerf.randomness import fold
+from nerf_lightning.nerf.rendering.ray_statistics import median_distances
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
+
+BYTES_PER_POINT = 12  # The distance and its weight; and as much as one of them again for the mesh.
+# Views that are fused, and the longer side of their pictures: as many pixels as the grid has cells, but so many
+# at most.
+VIEWS, LONGEST = 60, 512
+OPAQUE = 0.5  # Pixels that stop less light see through the box.
+# A view at a grazing angle says little; of nothing, less than of something; a coarse one, less than a fine one.
+LEAST_COSINE, NOTHING, LEAST_SHARE = 0.05, 0.3, 0.25
+# Half of what one view counts that looks squarely: a surface that all of them see less well is not there.
+LEAST_WEIGHT = 0.5
+
+
+def mesh_of_depth(
+    model: Model, record: SceneRecord, lattice: Lattice, truncation: float, tile_points: int, report: Report
+) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+    """Return vertices (scene frame) and faces of the surface that training views see, open where none looks.
+
+    `truncation` says how far before and behind a surface its distance is kept, in cells.
+    """
+    fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or take what.surface=density.", __package__)
+    lower, reach = lattice.lower.numpy(), truncation * lattice.spacing
+    distance, weight = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
+    rays_of = depth_rays(record, max(lattice.shape))
+    cameras = rays_of.cameras
+    for view in range(len(cameras.width)):
+        depth, trust = depth_view(model, record.background, rays_of, view, lattice.spacing, tile_points)
+        numbers = torch.cat([cameras.c2w[view].reshape(-1), cameras.focal[view], cameras.center[view]]).numpy()
+        fuse.add_view(distance, weight, lower, lattice.spacing, numbers, depth.numpy(), trust.numpy(), reach)
+        report("depth", (view + 1) / len(cameras.width))
+    if not ((weight > 0) & (distance < 0)).any():
+        raise InputError(
+            f"There is no surface to export: no training view of {for_terminal(record.name)} sees anything opaque in "
+            "its box. Train longer, or correct the box (scene.aabb_half) or the cameras' poses, and train again."
+        )
+    np.negative(distance, out=distance)
+    vertices, faces = marching_cubes(distance, 0.0, report)
+    del distance
+    faces = faces[_known(vertices, faces, weight)]
+    if not len(faces):
+        raise InputError(
+            f"No surface of {for_terminal(record.name)} is seen well enough to be a mesh: each of its places is seen "
+            "at a grazing angle only, or by coarse pixels. Give a smaller what.resolution, or what.surface=density."
+        )
+    return lattice.to_scene(vertices), faces
+
+
+def _known(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], weight: Float[ndarray, "x y z"]
+) -> ndarray:
+    """Tell the faces of cells whose eight corners are known: elsewhere the surface would part what no view tells."""
+    cell = np.floor(vertices[faces].mean(axis=1)).astype(np.int64)
+    cell = np.minimum(cell, np.array(weight.shape) - 2)
+    known = np.ones(len(faces), bool)
+    for corner in np.ndindex(2, 2, 2):
+        known &= weight[tuple((cell + corner).T)] >= LEAST_WEIGHT
+    return known
+
+
+def depth_view(
+    model: Model, background: Background, rays_of: RayGenerator, view: int, spacing: float, tile_points: int
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Return what one view says of the surface; `spacing` is that of the grid, in scene units.
+
+    The distance along each ray at which half of the stopped light was stopped (inf: the ray meets nothing), and how
+    much that counts: the cosine of the angle to the surface, less where a pixel covers many cells.
+    """
+    rays = rays_of(all_pixels(rays_of.cameras, view))
+    flat = rays.map(lambda part: part.flatten(0, 1)).to(next(model.parameters()).device)
+    depths, opacities = [], []
+    for part, levels in weighted_renderings(model, flat, background, fold(0, "surface"), tile_points):
+        depths.append(median_distances(levels[-1], part).cpu())
+        opacities.append(levels[-1].opacity.cpu())
+    depth = torch.cat(depths).view(rays.near.shape).float()
+    meets = torch.cat(opacities).view(rays.near.shape) > OPAQUE
+    # Differences, which are steep beside an edge: of pixels there it is not known which surface they see.
+    down, along = torch.gradient(rays.origins + depth[..., None] * rays.directions, dim=(0, 1))
+    normals = normalize(torch.linalg.cross(down, along), dim=-1)
+    cosine = (normals * rays.directions).sum(dim=-1).abs().clamp(min=LEAST_COSINE)
+    share = (spacing * rays_of.cameras.focal[view].min() / depth).clamp(LEAST_SHARE, 1.0)
+    trust = torch.where(meets, cosine * share, NOTHING)
+    return torch.where(meets, depth, torch.inf), trust.float()
+
+
+def depth_rays(record: SceneRecord, cells: int) -> RayGenerator:
+    """Return the rays of pinholes that look as training views do: depth is rendered, so no lens is needed.
+
+    The longer side of a picture has as many pixels as the longest side of the grid has cells.
+    """
+    views = [view for view in record.splits["train"] if record.far[view] > record.near[view]]
+    chosen = evenly_spaced_subset(views, VIEWS)
+    cameras, near, far = record.cameras[chosen], record.near[chosen], record.far[chosen]
+    longest = min(cells, LONGEST)
+    if cameras.lens_model == "equirectangular":
+        faces = len(CUBE)
+        return RayGenerator(_cube(cameras, longest), near.repeat_interleave(faces), far.repeat_interleave(faces))
+    share = longest / torch.maximum(cameras.width, cameras.height)
+    width, height = ((share * size).round().long().clamp(min=2) for size in (cameras.width, cameras.height))
+    pinholes = replace(cameras, lens=torch.zeros_like(cameras.lens), lens_model="pinhole")
+    return RayGenerator(resized(pinholes, width, height), near, far)
+
+
+# Right, up and back of cameras that together look everywhere, in the axes of one: ahead, left, back, right, up, down.
+CUBE = (
+    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+)
+
+
+def _cube(cameras: Cameras, size: int) -> Cameras:
+    """Return six pinholes in place of each panorama."""
+    turned = torch.tensor(CUBE).to(cameras.c2w).mT
+    axes = (cameras.c2w[:, None, :, :3] @ turned).flatten(0, 1)
+    c2w = torch.cat([axes, cameras.c2w[:, :, 3:].repeat_interleave(len(CUBE), dim=0)], dim=-1)
+    return pinhole_cameras(c2w, 0.5 * size, size, size)

@@ -1,0 +1,112 @@
+"""Mesh files: PLY, OBJ and GLB, with a normal and a colour for each vertex or with a texture, by optional libraries."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.errors import require_extra
+from nerf_lightning.nerf.geometry.frames import y_up
+from nerf_lightning.nerf.rendering.linear_light import to_linear
+
+MeshFormat = Literal["ply", "obj", "glb"]
+MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points as LAS"}
+"""What each extra of this package is needed for."""
+
+
+@dataclass(frozen=True)
+class GltfFrame:
+    """How vertices become glTF's, where y is up and a unit is a metre: the root node turns and scales their frame.
+
+    PLY and OBJ say nothing of up and of units, and keep the frame.
+    """
+
+    up: Float[ndarray, "3"]
+    """The unit vector that points up, in the frame of the vertices."""
+    metres: float
+    """How long a unit of that frame is; where nobody knows, 1."""
+
+    def __call__(self, tree: dict[str, Any]) -> None:
+        """Place the root node, and let no viewer add light of its own: it is in the colours already."""
+        (root,) = tree["scenes"][tree["scene"]]["nodes"]
+        placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(torch.from_numpy(self.up)).numpy()
+        tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
+        for primitive in (each for mesh in tree["meshes"] for each in mesh["primitives"]):
+            primitive["material"] = 0
+
+
+def save_mesh(
+    path: Path,
+    vertices: Float[ndarray, "vertices 3"],
+    faces: Int[ndarray, "faces 3"],
+    normals: Float[ndarray, "vertices 3"],
+    frame: GltfFrame,
+    colors: UInt8[ndarray, "vertices 3"],
+) -> list[Path]:
+    """Write a mesh with an sRGB colour per vertex, whole or not at all; the ending says in which format."""
+    trimesh = require_library("trimesh")
+    form = path.suffix[1:]
+    if form == "glb":  # glTF takes the bytes of vertices' colours for linear light
+        colors = np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
+    settings: dict[str, dict[str, Any]] = {
+        "ply": {"vertex_normal": True},
+        "obj": {"include_normals": True, "header": None},
+        "glb": {"include_normals": True, "tree_postprocessor": frame},
+    }
+    content = mesh.export(file_type=form, **settings[form])
+    with whole_file(path) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+    return [path]
+
+
+def save_textured_mesh(
+    path: Path,
+    vertices: Float[ndarray, "vertices 3"],
+    faces: Int[ndarray, "faces 3"],
+    normals: Float[ndarray, "vertices 3"],
+    frame: GltfFrame,
+    uv: Float[ndarray, "vertices 2"],
+    picture: UInt8[ndarray, "height width 3"],
+) -> list[Path]:
+    """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
+
+    Each is whole or not there; the OBJ, which names the others, comes last. `uv` says where each vertex lies in the
+    picture (sRGB), from 0 to 1, to the right and up.
+    """
+    trimesh = require_library("trimesh")
+    image, visual = Image.fromarray(picture), trimesh.visual
+    form = path.suffix[1:]
+    if form == "glb":
+        material = visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    else:
+        # Full ambient and diffuse light and no highlights: the light is in the colours already.
+        material = visual.material.SimpleMaterial(image, ambient=[1.0] * 3, diffuse=[1.0] * 3, specular=[0.0] * 3)
+        material.name = path.stem
+    textured = visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=textured, process=False)
+    if form == "glb":
+        contents = {path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=frame)}
+    else:
+        exchange = require_library("trimesh.exchange.obj")
+        settings = {"include_normals": True, "return_texture": True, "header": None}
+        text, beside = exchange.export_obj(mesh, mtl_name=path.with_suffix(".mtl").name, **settings)
+        contents = {path.with_name(name): content for name, content in beside.items()} | {path: text.encode()}
+    for each, content in contents.items():
+        with whole_file(each) as part:
+            part.write_bytes(content)
+    return list(contents)
+
+
+def require_library(name: str, extra: str = "mesh") -> Any:
+    """Return a module of an extra, or say how it is installed."""
+    return require_extra(name, extra, f"Exporting {MADE_BY[extra]}")

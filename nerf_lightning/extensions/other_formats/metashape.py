@@ -1,0 +1,208 @@
+"""Agisoft Metashape's cameras (File > Export > Export Cameras, Agisoft XML) beside the photographs."""
+
+import logging
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import find_pictures
+from nerf_lightning.data.captures.reader import CaptureReader
+from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.files.budgets import limits, require_within
+from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.files.trust import reading
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
+from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
+from nerf_lightning.nerf.types.scene import LensModel
+
+HEAD = 4096
+LENSES: dict[str, LensModel] = {"frame": "radial_tangential", "fisheye": "fisheye", "spherical": "equirectangular"}
+"""By a sensor's type."""
+OFF = ("0", "false")
+"""What `enabled` is of cameras that are switched off."""
+OF_ITS_OWN = ("b2", "p3", "p4")
+"""Skew, and the higher tangential terms."""
+CURE = "Export the cameras again (Agisoft XML)."
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A camera's intrinsics."""
+
+    lens_model: LensModel
+    size: tuple[float, float]
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    lens: tuple[float, float, float, float, float, float]
+
+
+@dataclass
+class MetashapeReader(CaptureReader):
+    """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
+
+    Args:
+        file: the xml below root; null: the only one there.
+    """
+
+    named_by = (".xml",)
+
+    name: str = "metashape"
+    file: str | None = None
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        return next((path.name for path in sorted(folder.glob("*.xml")) if _is_ours(path)), None)
+
+    def capture(self) -> Capture:
+        """Return the aligned photographs, in the file's order."""
+        root = self.folder()
+        path = self._path(root)
+        text = read_text(path, limits().json_bytes, CURE)
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise InputError(f"{path} declares entities of its own, which no file of Metashape's does. {CURE}")
+        chunk = _chunk(text, path)
+        left_out = LeftOut(str(path))
+        cameras = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("label")]
+        require_within("views", len(cameras), str(path), "views")
+        aligned = [camera for camera in cameras if camera.findtext("transform") and camera.get("enabled") not in OFF]
+        labels = [str(camera.get("label")) for camera in cameras]
+        pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
+        sensors = {each.get("id", ""): each for each in chunk.iterfind("sensors//sensor")}
+        views, lenses = [], set[LensModel]()
+        for camera, label in ((camera, str(camera.get("label"))) for camera in aligned):
+            with left_out.unless_usable(label):
+                if label not in pictures:
+                    raise InputError(f"{path}: no picture below {root} is called {label}. Copy it there.")
+                sensor = _sensor(sensors.get(camera.get("sensor_id", "")), camera.get("sensor_id", ""), path)
+                views.append(_view(camera, label, sensor, pictures[label], path))
+                lenses.add(sensor.lens_model)
+        left_out.require_enough(len(views))
+        if terms := sorted({each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and _number(each.text, path)}):
+            log.warning("%s: the lens has %s, which is not known here and is left out", path, " and ".join(terms))
+        posed = {view.name for view in views} | left_out.faults.keys()
+        left_out.without_pose = tuple(label for label in labels if label not in posed)
+        lens_model = one_lens_model(lenses, path)
+        return Capture(tuple(views), path, lens_model, undo=_chunk_to_world(chunk, path), left_out=left_out)
+
+    def _path(self, root: Path) -> Path:
+        """Return the file that the user has named, or the only one."""
+        named = Path(self.root).expanduser()
+        if self.file is not None or os.path.isfile(named):
+            return named if self.file is None else root / self.file
+        found = [path for path in sorted(root.glob("*.xml")) if _is_ours(path)]
+        if len(found) == 1:
+            return found[0]
+        if not found:
+            raise InputError(f"{root} holds no xml of Metashape's cameras. Export them there, or set scene.file=NAME.")
+        names = listed((path.name for path in found), 4)
+        raise InputError(f"{root} holds {len(found)} files of Metashape's cameras ({names}). Give scene.root=FILE.")
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        with open_regular(path, None) as file:
+            start = file.read(HEAD)
+    except (OSError, InputError):
+        return False
+    start = start.replace(b"\0", b"")  # of UTF-16
+    return b"<document" in start and b"<chunk" in start
+
+
+def _chunk(text: str, path: Path) -> Element:
+    """Return the first chunk that has aligned cameras, or else the first with cameras."""
+    with reading(path, CURE):
+        document = ElementTree.fromstring(text)
+    chunks = [chunk for chunk in document.iterfind("chunk") if chunk.find("cameras//camera") is not None]
+    if not chunks:
+        raise InputError(f"{path} holds no chunk of cameras. {CURE}")
+    aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None] or chunks
+    if len(chunks) > 1:
+        log.warning(
+            "%s: of %d chunks the first with aligned cameras is read. Export each alone to read another",
+            *(path, len(chunks)),
+        )
+    return aligned[0]
+
+
+def _sensor(sensor: Element | None, number: str, path: Path) -> Sensor:
+    kind = "" if sensor is None else sensor.get("type", "frame")
+    resolution = None if sensor is None else sensor.find("resolution")
+    if sensor is None or resolution is None or kind not in LENSES:
+        raise InputError(
+            f"{path}: the sensor {number} is absent, has no resolution, or is of another type than "
+            f"{listed(LENSES)} ({kind}). {CURE}"
+        )
+    width, height = (_number(resolution.get(side), path) for side in ("width", "height"))
+    if kind == "spherical":
+        panorama = (width / (2 * math.pi), height / math.pi), (width / 2, height / 2)
+        return Sensor("equirectangular", (width, height), *panorama, (0.0,) * 6)
+    found = list(sensor.iterfind("calibration"))
+    adjusted = next((each for each in found if each.get("class") == "adjusted"), found[0] if found else None)
+    if adjusted is None:
+        raise InputError(f"{path}: the sensor {number} has no calibration. Align the photographs, and export again.")
+
+    def number_of(key: str) -> float:
+        return _number(adjusted.findtext(key, "0"), path)
+
+    f, b1 = number_of("f"), number_of("b1")
+    # Metashape's P1 and P2 are OpenCV's p2 and p1; its centre counts from the middle of the picture.
+    k1, k2, k3, k4, p2, p1 = (number_of(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    center = (width / 2 + number_of("cx"), height / 2 + number_of("cy"))
+    return Sensor(LENSES[kind], (width, height), (f + b1, f), center, (k1, k2, k3, k4, p1, p2))
+
+
+def _view(camera: Element, label: str, sensor: Sensor, picture: Path, path: Path) -> View:
+    words = camera.findtext("transform", "").split()
+    c2w = pose_from_matrix(_numbers(words, path), f"{path}: the transform of {label}")
+    return View(
+        name=label,
+        photograph=Photograph(picture),
+        c2w=flip_yz(c2w),
+        focal=sensor.focal,
+        center=sensor.center,
+        size=sensor.size,
+        lens=sensor.lens,
+    )
+
+
+def _chunk_to_world(chunk: Element, path: Path) -> Float[Tensor, "4 4"]:
+    """Return what takes the chunk's frame to the world's, where the chunk is referenced."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    transform = chunk.find("transform")
+    if transform is None:
+        return matrix
+    rotation = _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), path)
+    shift = _numbers(transform.findtext("translation", "0 0 0").split(), path)
+    scale = _number(transform.findtext("scale", "1"), path)
+    if (len(rotation), len(shift)) == (9, 3):
+        matrix[:3] = torch.cat([matrix.new_tensor(rotation).reshape(3, 3), matrix.new_tensor(shift)[:, None]], dim=1)
+    if (len(rotation), len(shift)) != (9, 3) or not is_rigid(matrix[:3]):
+        raise InputError(f"{path}: the chunk's transform is no rotation with a shift and a scale. {CURE}")
+    matrix[:3, :3] *= scale
+    return matrix
+
+
+def _number(word: str | None, path: Path) -> float:
+    (number,) = _numbers([word or ""], path)
+    return number
+
+
+def _numbers(words: list[str], path: Path) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise InputError(f"{path} holds {' '.join(words)!r} where numbers of a camera belong. {CURE}") from None
