@@ -86,7 +86,8 @@ def _index() -> Iterator[str]:
 def _api() -> Iterator[str]:
     yield '# API\n\nShapes are in the annotations: `Float[Tensor, "*rays 3"]` is any number of rays by 3.\n'
     yield "## nerf_lightning\n"
-    names = getattr(nerf_lightning, "__all__", nerf_lightning._OFFERED)
+    stub = Path(nerf_lightning.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    names = re.findall(r"^from \S+ import (\w+) as", stub, re.MULTILINE)
     yield from (_documented(f"nerf_lightning.{name}", getattr(nerf_lightning, name)) for name in sorted(names))
     yield "## The library: nerf_lightning.nerf\n"
     for section, paths in LIBRARY.items():

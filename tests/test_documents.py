@@ -56,7 +56,7 @@ def test_the_example_runs_without_hydra_and_lightning():
 
 
 def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
-    (example,) = [block for block in blocks("docs/python.md") if "build_run" in block]
+    (example,) = [block for block in blocks("docs/python.md") if "Trainer(" in block]
     # A small scene and short runs, or it would take minutes.
     capture = write_npz(tmp_path / "capture.npz")
     small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
@@ -105,6 +105,14 @@ def test_the_example_of_the_readme_trains_loads_and_renders(tmp_path):
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     assert output.splitlines()[-1].startswith("torch.Size([")
+
+
+def test_the_example_of_cameras_in_memory_trains_and_resumes_to_the_bit(tmp_path):
+    (example,) = [block for block in blocks("docs/python.md") if "from_cameras" in block]
+    process = start_code(example.replace("steps(20)", "steps(4)").replace("== 10", "== 2"), cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert output.splitlines()[-1] == "4 True"
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/extending.md"])

@@ -110,6 +110,11 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
     content = read_content(path)
     if to_resume:
         _Kept.content = _identity(path), content
+    return checkpoint_of(content, path)
+
+
+def checkpoint_of(content: dict[str, Any], path: Path) -> Checkpoint:
+    """Return the content of a checkpoint as what it says; `path` is where it lies."""
     record, prefix = content[KEY], "model."
     with reading(path, _instead_of(path)):
         state = content["state_dict"] | (dequantized(record["quantized"], str(path)) if "quantized" in record else {})

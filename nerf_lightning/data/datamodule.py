@@ -14,6 +14,7 @@ from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
 # Of a batch, at least: where its pixels lie, its rays, and what they should look like.
@@ -90,9 +91,8 @@ class RayDataModule(LightningDataModule):
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
         _check_background(scene)
         _check_patch(scene, patch, batch_rays)
-        for split in ("train", "val"):
-            if not scene.splits.get(split):
-                raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
+        if not scene.splits.get("train"):
+            raise InputError(f"The scene {scene.name} has no train views, and training needs some.")
         if overfit_views is not None:
             scene = _few_views(scene, overfit_views)
         _check_views_per_step(views_per_step, batch_rays, sample_budget, patch, depth_every)
@@ -128,8 +128,10 @@ class RayDataModule(LightningDataModule):
         self.batches.num_steps = trainer.max_steps if counts_steps else self.batches.epoch_steps  # type: ignore[union-attr]
         return self.batches
 
-    def val_dataloader(self) -> FixedRays:
-        """Return the fixed validation rays."""
+    def val_dataloader(self) -> FixedRays | list[Batch]:
+        """Return the fixed validation rays; none of a scene without validation views, which Lightning passes over."""
+        if not self.scene.splits.get("val"):
+            return []
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
 
     def test_dataloader(self) -> WholeViews:

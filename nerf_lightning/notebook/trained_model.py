@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
-from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands.export import export as export_checkpoint
 from nerf_lightning.config.compose import compose_config, composed_job
@@ -21,6 +20,7 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
@@ -48,28 +48,32 @@ class TrainedModel:
         """Render the view of a camera.
 
         Args:
-            camera: one camera in the frame of `self.scene` (`scene.cameras[3]`, `self.path("orbit")[0]`), or the
-                number or name of a view.
-            background: white, black or none; None: as in training.
+            camera: one camera in the user's own frame (of `Cameras.from_opencv`, `scene.user_cameras[3]` of any reading
+                of the capture, `model.path("orbit")[0]`), or the number or the name of a view of `model.scene`.
+            background: what lies behind the scene: white, black or none; None: as in training.
 
         Returns:
             On the CPU: `rgb` (height x width x 3, sRGB in [0, 1] up to rounding), `depth` (height x width, the expected
-            distance along each pixel's ray in scene units; light that escapes ends at far), `opacity` (height x width).
+            distance along each pixel's ray in the user's units; light that escapes ends at far), `opacity` (height x
+            width).
 
         Raises:
             InputError: unknown view or background, or several cameras.
         """
         with torch.no_grad(), in_words("render"):
-            behind = known_background(background or self.scene.background)
+            scene, behind = self.scene, known_background(background or self.scene.background)
             if isinstance(camera, Cameras):
-                subject = Subject(self.module, self.scene, behind)
-                return shot_of(subject, _one(camera), self.tile_points).picture(0)
-            scene, view = self.scene, self._view(camera)
-            rays_of = RayGenerator.of_views(scene, self.module)
-            return render_picture(self.module, rays_of, view, behind, self.tile_points)
+                one = _one(camera)
+                c2w = poses_from_user(one.c2w.double().cpu(), scene.to_user).float()
+                shot = shot_of(Subject(self.module, scene, behind), replace(one.to("cpu"), c2w=c2w), self.tile_points)
+                picture = shot.picture(0)
+            else:
+                rays_of = RayGenerator.of_views(scene, self.module)
+                picture = render_picture(self.module, rays_of, self._view(camera), behind, self.tile_points)
+            return replace(picture, depth=unit_of(scene.to_user) * picture.depth)
 
     def path(self, name: str = "orbit", **settings: Any) -> Cameras:
-        """Return the cameras of a path around the capture, one per frame.
+        """Return the cameras of a path around the capture, in its own frame, one per frame.
 
         Args:
             name: a path in `conf/path/`: orbit, spiral, keyframes, ...
@@ -83,7 +87,8 @@ class TrainedModel:
         with in_words("render"):
             config, _ = compose_config("render", overrides)
             subject = Subject(self.module, self.scene, self.scene.background)
-            return lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
+            cameras = lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
+            return replace(self.scene, cameras=cameras).user_cameras
 
     def of_scene(self, scene: Scene) -> "TrainedModel":
         """Return the same network for another scene, from whose photographs it then renders.
@@ -98,16 +103,6 @@ class TrainedModel:
         shown = shown_capture(scene)
         show_photographs(self.module, shown)
         return replace(self, checkpoint=replace(self.checkpoint, scene=scene_record(shown), given_cameras=None))
-
-    def in_frame(self, scene: Scene) -> Scene:
-        """Return a scene in the frame of this model, with its refined cameras, if any.
-
-        A capture that is read with other settings (`frames`, `downscale`) may have another working frame.
-
-        Raises:
-            InputError: the scene was read with another `space` than the model was trained in.
-        """
-        return as_trained(scene, self.checkpoint)
 
     def export(self, what: str, folder: str | os.PathLike[str] | None = None, **settings: Any) -> list[Path]:
         """Write files for other programs, as `nerf export` does: `model.export("splats", format="spz")`.

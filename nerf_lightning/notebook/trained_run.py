@@ -13,6 +13,8 @@ from nerf_lightning.config.messages import in_words
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.notebook.run import of_scene
 from nerf_lightning.notebook.trained_model import TrainedModel, load
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.processes import num_processes
@@ -33,7 +35,7 @@ class TrainedRun:
     """The model of its last checkpoint."""
 
 
-def train(*overrides: str) -> TrainedRun:
+def train(*overrides: str, scene: Scene | None = None) -> TrainedRun:
     """Train as `nerf train` does, in this process, and return the run.
 
     `nl.train("scene=blender", "scene.root=data/lego", "model=fast", "trainer.max_steps=800")` takes the overrides of
@@ -42,19 +44,21 @@ def train(*overrides: str) -> TrainedRun:
 
     Args:
         *overrides: settings, one string each.
+            scene: from `Scene.from_cameras` or `nl.read`, instead of the config's.
 
     Raises:
         InputError: a setting or the capture is invalid; nothing is left half-written.
         KeyboardInterrupt: the run was stopped; its checkpoint is saved.
     """
-    with in_words("train"), composed_job("train", prepared("train", list(overrides))) as config:
+    with in_words("train"), composed_job("train", prepared("train", list(of_scene(scene, overrides)))) as config:
         set_limits(Budgets(**config.budgets))
         _require_one_process(config.trainer)
         try:
-            done = train_in_folder(config)
+            done = train_in_folder(config, scene)
         except SystemExit as stop:
             raise KeyboardInterrupt(f"The training was stopped (exit code {stop.code}).") from None
-    metrics = read_json_object(done.folder / FILES["run"]) if config.final.evaluate else {}
+    measured = done.folder / FILES["run"]
+    metrics = read_json_object(measured) if config.final.evaluate and measured.is_file() else {}
     of_the_machine = ("trainer=", "trainer.accelerator=", "trainer.num_threads=")
     model = load(done.folder, *(each for each in overrides if each.startswith(of_the_machine)))
     return TrainedRun(done.folder, done.psnr, metrics, model)

@@ -159,10 +159,12 @@ class RadianceFieldSystem(LightningModule):
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
                 "Go on from it with a smaller optimizer.lr, or add gradient clipping (trainer.clip_norm=1)."
             )
-        checkpoint[KEY] = self.record | run_state(self.step)
+        checkpoint[KEY] = self.kept_record()
+
+    def kept_record(self) -> dict[str, Any]:
+        """Return what makes a checkpoint self-contained, and the run's state beyond weights and optimizer."""
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
-        if refined is not None:
-            checkpoint[KEY]["refined"] = dict(vars(refined))
+        return self.record | run_state(self.step) | ({} if refined is None else {"refined": dict(vars(refined))})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check what Lightning is about to restore, and restore the rest of the run.

@@ -72,7 +72,9 @@ class PostTraining:
         tile_points = settings.inference_tile_points
         scene, moved = _with_learnt_cameras(scene, trainer)
         with torch.no_grad():
-            if self.scoring is not None:
+            if self.scoring is not None and not scene.splits.get(self.scoring.split):
+                lines.append(f"not measured: the scene has no {self.scoring.split} views")
+            elif self.scoring is not None:
                 system: Any = trainer.lightning_module
                 config, choices = system.record["config"], system.record["choices"]
                 how = settings.device, settings.precision, trainer.global_step

@@ -1,7 +1,6 @@
 """What all captures share: from a format's views to a scene in a working frame."""
 
 import logging
-import math
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -16,9 +15,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, contents, usable
-from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
-from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
+from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
 from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
@@ -28,11 +26,8 @@ from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
-Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 MOST_PIXELS = 640
 """Of the longer side of photographs whose size the user leaves open."""
 MOST_AROUND = 2048
@@ -128,10 +123,6 @@ class CaptureReader(Reader):
         has_edge = capture.lens_model in ("pinhole", "radial_tangential")
         pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and self.background != "none")
         cameras = cameras_of(capture, files, pixels, downscale)
-        names = tuple(view.name for view in capture.views)
-        require_invertible(cameras, names)
-        space, reason = choose_space(self.space, cameras, capture, pixels.has_transparency)
-        log.info("%s: space=%s, %s", self.name, space, reason)
         protocol = {
             "downscale": str(downscale),
             "filter": "none" if downscale == 1 else "area, premultiplied",
@@ -139,30 +130,18 @@ class CaptureReader(Reader):
             "frames": self.frames or "all",
         }
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
-        extent = extent_of(capture, cameras, space, self.near, self.far)
-        to_user = capture.undo @ extent.to_user
-        depths = known_depths(capture, cameras)
-        if depths is not None:
-            depths = replace(depths, distance=(depths.distance / unit_of(extent.to_user)).float())
-        require_possible(extent, to_user, capture)
-        return Scene(
+        return scene_of(
+            capture,
+            cameras,
+            pixels,
+            splits,
             name=self.name,
-            cameras=replace(cameras, c2w=poses_from_user(cameras.c2w, extent.to_user).float(), ndc=extent.ndc),
-            pixels=pixels,
-            near=extent.near,
-            far=extent.far,
-            aabb=extent.aabb,
-            splits=splits,
-            view_names=names,
+            space=self.space,
+            near=self.near,
+            far=self.far,
             background=background_for(self.background, color, "black"),
-            space=space,
-            depths=depths,
-            points=points_from_user(capture.points, extent.to_user).float(),
-            to_user=to_user,
-            metres_per_unit=self.metres_per_unit,
             protocol=protocol | protocol_of(color) | remembered,
-            truth=None,
-            left_out=capture.left_out.names,
+            metres_per_unit=self.metres_per_unit,
         )
 
     def folder(self) -> Path:
@@ -249,16 +228,10 @@ class CaptureReader(Reader):
             check_step("downscale", self.downscale)
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
-        if self.space not in get_args(Spaces):
-            raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         check_metres(self.metres_per_unit)
         background_for(self.background, None, "black")
-        near, far = self.near, self.far
-        if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
-            raise InputError(
-                f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units."
-            )
+        check_extent(self.space, self.near, self.far)
 
     def _wanted(self, capture: Capture) -> Capture:
         """Return the views whose names fit the pattern `frames`."""

@@ -7,7 +7,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.data.captures.reader import Spaces
+from nerf_lightning.data.captures.scene import Spaces
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.extensions.many_scenes.brick_models import BrickModelReader

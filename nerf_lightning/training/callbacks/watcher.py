@@ -83,9 +83,12 @@ def _writes(thread: threading.Thread | None) -> bool:
 
 
 def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
-    """Return the number-th validation view (counted round) and its picture, in the precision of training."""
+    """Return the number-th validation view (counted round) and its picture, in the precision of training.
+
+    Where there are none, of the training views.
+    """
     scene = trainer.datamodule.scene
-    views = scene.splits["val"]
+    views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
     tile_points = system.step.tile_points or WHOLE_BATCH_POINTS
     system.eval()
