@@ -1,7 +1,7 @@
 """nerf_lightning: train radiance fields from photographs and render new views.
 
-From Python: `read` a capture, `train` a model, `load` a trained one; step by step, or with Lightning's own Trainer: `build_run`,
-`RadianceFieldSystem` and `RayDataModule`. They are imported on first use; `__init__.pyi` has all names.
+From Python: `read` a capture, `train` a model, `load` a trained one; step by step, or with Lightning's own Trainer:
+`build_run`, `RadianceFieldSystem` and `RayDataModule`. They are imported on first use; `__init__.pyi` has all names.
 """
 
 import importlib
