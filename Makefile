@@ -3,6 +3,7 @@ VENV ?= .venv
 # Another index for wheels, for instance PyTorch's own CPU index on a machine without a GPU.
 TORCH_INDEX ?=
 XLA_VENV := .venv-xla
+NERFBASELINES_VENV := .venv-nerfbaselines
 # Hydra overrides: make train ARGS="scene=blender scene.root=data/lego"
 ARGS ?=
 # How long make soak lasts.
@@ -32,7 +33,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -70,6 +71,19 @@ test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where to
 	@$(MAKE) --no-print-directory xla \
 		|| { echo "make: test-xla is skipped: torch_xla 2.9 cannot be installed here (Linux x86-64, Python 3.11 to 3.13)"; exit 0; }; \
 	PJRT_DEVICE=CPU $(XLA_VENV)/bin/python -m pytest -m xla tests/xla tests/commands/test_command_on_xla.py
+
+test-nerfbaselines: ## Run the tests of the method in NerfBaselines; skipped where that cannot be installed
+	@$(MAKE) --no-print-directory nerfbaselines \
+		|| { echo "make: test-nerfbaselines is skipped: NerfBaselines cannot be installed here (see pip's message above)"; exit 0; }; \
+	$(NERFBASELINES_VENV)/bin/python -m pytest tests/adapters
+
+nerfbaselines: $(NERFBASELINES_VENV)/.ready ## Make an environment for NerfBaselines, .venv-nerfbaselines: it wants numpy 1
+$(NERFBASELINES_VENV)/.ready: pyproject.toml constraints/torch.txt
+	@$(PYTHON) -m venv $(NERFBASELINES_VENV)
+	$(NERFBASELINES_VENV)/bin/python -m pip --disable-pip-version-check install -q $(PINNED) torch
+	$(NERFBASELINES_VENV)/bin/python -m pip --disable-pip-version-check install -q $(PINNED) -e . 'nerfbaselines>=1.2.12' \
+		'pytest>=8' 'pytest-xdist>=3.5' 'hypothesis>=6.100' 'beartype>=0.18'
+	@touch $@
 
 test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
@@ -123,5 +137,5 @@ fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_planted_resume.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
-	rm -rf $(VENV) $(XLA_VENV) build dist docs/_build docs/settings.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) $(XLA_VENV) $(NERFBASELINES_VENV) build dist docs/_build docs/settings.md docs/index.md docs/api.md docs/security.md docs/contributing.md docs/changelog.md docs/extension_*.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 	find nerf_lightning tests -name __pycache__ -type d -exec rm -rf {} +

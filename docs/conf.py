@@ -7,16 +7,31 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
 import settings_page  # noqa: E402
+import site_pages  # noqa: E402
 
-project = "nerf_lightning"
-extensions = ["myst_parser", "sphinx.ext.mathjax"]
-myst_enable_extensions = ["dollarmath", "colon_fence"]
-myst_heading_anchors = 3
+project = html_title = "nerf_lightning"
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx_copybutton"]
 html_theme = "furo"
-html_title = "nerf_lightning"
 html_show_copyright = False
-exclude_patterns = ["_build"]
-# Files of the repository outside of docs are shown as links, and checked by tests/test_documents.py.
+exclude_patterns = ["_build", "README.md"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+# Links to source files, which the site does not have; tests/test_documents.py checks that they exist.
 suppress_warnings = ["myst.xref_missing"]
+# Tests run the notebooks; here they are shown as they are.
+nb_execution_mode = "off"
+autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+maximum_signature_line_length = 100
+# Docstrings write `code` as Markdown does.
+default_role = "code"
 
 settings_page.write(HERE)
+site_pages.write()
+
+
+def setup(app):
+    """Make links between documents links within the site."""
+    app.connect("source-read", lambda app, page, text: text.__setitem__(0, site_pages.within_site(text[0], HERE)))

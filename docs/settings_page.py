@@ -1,4 +1,4 @@
-"""The page of all settings: written by Sphinx when it builds the documents, from what `nerf help` reads."""
+"""The page of all settings, written when Sphinx builds the documentation, from what `nerf help` reads."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,8 +9,8 @@ from nerf_lightning.config.manual.pages import brief
 
 HEAD = """# Settings
 
-This page is made of the docstrings and yamls that the program is built from; `nerf help NAME` prints the same for one
-setting, group or option. A setting is given as `name=value`, an option of a group as `group=option`.
+Generated from docstrings and YAML files; `nerf help NAME` prints the same for one setting, group or option. A setting
+is given as `name=value`, an option of a group as `group=option`.
 """
 
 
@@ -33,8 +33,8 @@ def _of_group(command: Command, group: str) -> Iterator[str]:
     yield from (f"### {group}", "")
     if len(options) > 1:
         if default is not None:
-            yield from (f"`{default.typed}` where nothing is said.", "")
-        yield from ("| option | what it is |", "|---|---|")
+            yield from (f"Default: `{default.typed}`.", "")
+        yield from ("| option | description |", "|---|---|")
         yield from (f"| `{option.typed}` | {_cell(brief(option.about))} |" for option in options)
         yield ""
     yield from _table(each for option in options for each in option.settings)
@@ -44,7 +44,7 @@ def _table(settings: Iterable[Setting]) -> Iterator[str]:
     rows = {(each.key, each.meaning): each for each in settings if each.text and each.is_own}
     if not rows:
         return
-    yield from ("| setting | what it means | takes |", "|---|---|---|")
+    yield from ("| setting | description | type |", "|---|---|---|")
     for each in rows.values():
         takes = f"`{_cell(each.takes)}`" if each.takes else ""
         yield f"| `{each.key}={_cell(each.text)}` | {_cell(each.meaning)} | {takes} |"

@@ -1,37 +1,34 @@
-"""nerf_lightning: learn a radiance field from photographs with known cameras, and render new views.
+"""nerf_lightning: train radiance fields from photographs and render new views.
 
-From Python: `read` a capture, `load` a trained model, `train` one; with Lightning's own Trainer: `build_run`,
-`RadianceFieldSystem` and `RayDataModule`. They are loaded when they are asked for; `__init__.pyi` has their types.
+From Python: `read` a capture, `train` a model, `load` a trained one; step by step, or with Lightning's own Trainer:
+`build_run`, `RadianceFieldSystem` and `RayDataModule`. They are imported on first use; `__init__.pyi` has all names.
 """
 
 import importlib
+import re
+import sys
 import zlib  # noqa: F401  before pycolmap, which brings another that Pillow's PNGs would be mixed with
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-__version__ = "0.1.0"
-
-_OFFERED = {
-    "Cameras": "nerf_lightning.nerf.types.scene",
-    "InputError": "nerf_lightning.messages.errors",
-    "Picture": "nerf_lightning.nerf.models.render_image",
-    "RadianceFieldSystem": "nerf_lightning.training.system",
-    "RayDataModule": "nerf_lightning.data.datamodule",
-    "Scene": "nerf_lightning.nerf.types.scene",
-    "TrainedModel": "nerf_lightning.notebook.trained_model",
-    "TrainedRun": "nerf_lightning.notebook.trained_run",
-    "build_run": "nerf_lightning.training.build_run",
-    "load": "nerf_lightning.notebook.trained_model",
-    "read": "nerf_lightning.notebook.captures",
-    "train": "nerf_lightning.notebook.trained_run",
-}
+__version__ = "1.0.0"
 
 
-def __getattr__(name: str) -> Any:
-    """Load what brings torch and Lightning only now: it takes seconds."""
-    if name not in _OFFERED:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_OFFERED[name]), name)
+def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package that offers what the stub next to its `file` imports.
+
+    What brings torch, numba and Lightning takes seconds, so that it is imported only when it is asked for.
+    """
+    stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+    offered = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}
+
+    def load(name: str) -> Any:
+        if name not in offered:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(offered[name]), name)
+
+    return load, lambda: [*vars(sys.modules[package]), *offered]
 
 
-def __dir__() -> list[str]:
-    return [*globals(), *_OFFERED]
+__getattr__, __dir__ = lazily(__name__, __file__)

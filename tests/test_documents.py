@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from lightning import Trainer
 from support.captures import write_blender, write_npz
@@ -17,27 +18,35 @@ from nerf_lightning import build_run
 from nerf_lightning.cli.help import completion, help_on_anything
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
 from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.overrides import open_sections
 from nerf_lightning.files.folders import conf_folders
 
 ROOT = Path(__file__).parents[1]
+INDEX = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "docs" / page for page in re.findall(r"\]\((\w+\.md)\)", INDEX)]
 DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
-    *sorted((ROOT / "docs").glob("[!s]*.md")),
+    ROOT / "docs" / "README.md",
+    *PAGES,
     *sorted((ROOT / "nerf_lightning" / "extensions").glob("*/README.md")),
-    ROOT / "docs" / "scaling.md",
-    ROOT / "docs" / "sweeps.md",
 ]
 TAKE_PATHS = ("report", "table")
 
 
-def python_blocks(name):
-    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
-    return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+def blocks(document, language="python"):
+    text = (ROOT / document).read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_documents_are_short():
+    words = {document: len(document.read_text(encoding="utf-8").split()) for document in DOCUMENTS}
+    assert words.pop(ROOT / "README.md") <= 700
+    assert {document.name: count for document, count in words.items() if count > 1500} == {}
 
 
 def test_the_example_runs_without_hydra_and_lightning():
-    (example, *_) = [block for block in python_blocks("python.md") if "RadianceModel" in block]
+    (example, *_) = [block for block in blocks("docs/python.md") if "RadianceModel" in block]
     check = "\nimport sys\nprint([m for m in ('hydra', 'lightning', 'omegaconf') if m in sys.modules])\n"
     done = subprocess.run([sys.executable, "-c", example + check], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -47,7 +56,7 @@ def test_the_example_runs_without_hydra_and_lightning():
 
 
 def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
-    (example,) = [block for block in python_blocks("python.md") if "build_run" in block]
+    (example,) = [block for block in blocks("docs/python.md") if "Trainer(" in block]
     # A small scene and short runs, or it would take minutes.
     capture = write_npz(tmp_path / "capture.npz")
     small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
@@ -70,7 +79,7 @@ def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
 
 
 def test_the_example_of_the_surface_reads_trains_loads_and_renders(tmp_path):
-    (example,) = [block for block in python_blocks("python.md") if "nl.train" in block]
+    (example,) = [block for block in blocks("docs/python.md") if "nl.train" in block]
     capture = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
     small = ", ".join(f'"{each}"' for each in (*FAST, "final.video=false"))
     for given, instead in (
@@ -86,21 +95,49 @@ def test_the_example_of_the_surface_reads_trains_loads_and_renders(tmp_path):
     assert output.splitlines()[-1] == "torch.Size([8, 8, 3]) torch.Size([8, 8]) torch.Size([8, 8])"
 
 
-def test_the_eight_lines_of_an_encoder_are_an_encoder():
-    (example, *_) = [block for block in python_blocks("extending.md") if "(Encoder)" in block]
-    scope = {}
-    exec(compile(example, "extending.md", "exec"), scope)
-    import torch
+def test_the_example_of_the_readme_trains_loads_and_renders(tmp_path):
+    (example,) = [block for block in blocks("README.md") if "nl.train" in block]
+    capture = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
+    small = ", ".join(f'"{each}"' for each in (*FAST, "scene=blender", f"scene.root={capture}", "final.video=false"))
+    given = '"scene=bricks", "model=fast_small", "trainer.max_steps=300"'
+    assert example.count(given) == 1
+    process = start_code(example.replace(given, small).replace("num_frames=8", "num_frames=2, width=4"), cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert output.splitlines()[-1].startswith("torch.Size([")
 
-    encoder = next(value for name, value in scope.items() if name.endswith("Encoder") and name != "Encoder")()
-    assert encoder(torch.rand(5, 3)).shape == (5, encoder.out_dim)
+
+def test_the_example_of_cameras_in_memory_trains_and_resumes_to_the_bit(tmp_path):
+    (example,) = [block for block in blocks("docs/python.md") if "from_cameras" in block]
+    process = start_code(example.replace("steps(20)", "steps(4)").replace("== 10", "== 2"), cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert output.splitlines()[-1] == "4 True"
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/extending.md"])
+def test_the_few_lines_of_an_encoder_are_an_encoder(document):
+    (example,) = [block for block in blocks(document) if "(Encoder)" in block]
+    settings = yaml.safe_load(next(block for block in blocks(document, "yaml") if "my_parts." in block))
+    scope = {}
+    exec(compile(example, document, "exec"), scope)
+    encoder = scope[settings.pop("_target_").removeprefix("my_parts.")](**settings)
+    assert encoder(torch.ones(5, 3)).tolist() == [[2.0] * encoder.out_dim] * 5
     assert len([line for line in example.splitlines() if line.strip()]) <= 14
+
+
+def test_the_experiment_of_ones_own_composes(tmp_path):
+    (example,) = blocks("docs/experiments.md", "yaml")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "castle.yaml").write_text(example, encoding="utf-8")
+    config, choices = compose_config("train", [f"hydra.searchpath=[file://{tmp_path}]", "experiment=castle"])
+    assert (config.scene.root, config.trainer.max_steps, choices["model"]) == ("data/castle", 5000, "fast_proposal")
 
 
 def test_the_loss_in_a_file_of_ones_own_trains(tmp_path, monkeypatch):
     text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     assert "PYTHONPATH=. nerf train loss._target_=my_losses.L1\n" in text
-    (example,) = [block for block in python_blocks("extending.md") if "(Loss)" in block]
+    (example,) = [block for block in blocks("docs/extending.md") if "(Loss)" in block]
     (tmp_path / "my_losses.py").write_text(example, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     capture = write_npz(tmp_path / "capture.npz")
@@ -120,7 +157,8 @@ def commands():
         for words in (*lines, *re.findall(r"`([^`\n]+)`", text)):
             match = re.match(r"(?:srun |\.venv-xla/bin/)?nerf ([a-z]+.*)", words)
             if match and not any(
-                word in match[1] for word in ("...", "--help", "NAME", "encoder=scaled", "model=voxels", "scene=table")
+                word in match[1]
+                for word in ("...", "--help", "NAME", "encoder=scaled", "scene=table", "experiment=castle")
             ):
                 found.add(match[1].split("  #")[0].split(" # ")[0].strip())
     return sorted(found)
@@ -140,7 +178,7 @@ def test_a_command_composes(command):
         ]
     bare = [word for word in words if "=" not in word]
     assert not bare or name in TAKE_PATHS, f"{bare} are no settings"
-    compose_config(name, [word for word in words if "=" in word])
+    compose_config(name, open_sections(word for word in words if "=" in word))
 
 
 def known_settings():
@@ -159,6 +197,8 @@ def known_settings():
         shared = {"capture": "scene"}.get(file.stem, "") if group == "." else group
         prefix = "" if "@package _global_" in text else shared.replace("/", ".")
         gather(yaml.safe_load(text) or {}, prefix)
+        if group == "what":
+            gather(yaml.safe_load(text) or {}, f"final.{file.stem}")
         keys.add(group)
     return keys
 
@@ -169,12 +209,17 @@ def test_settings_that_are_named_are_there():
         text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
         for code in re.findall(r"`([^`\n]+)`", text):
             for word in code.split():
-                match = re.fullmatch(r"\+?([a-z_/]+(?:\.[a-z_]+)*)(?:@[\w.]+)?(?:=.*)?", word)
+                match = re.fullmatch(r"([a-z_/]+(?:\.[a-z_]+)*)(?:@[\w.]+)?(?:=.*)?", word)
                 if match is None or ("=" not in word and "." not in word) or "/" in match[1].replace("hydra/", ""):
                     continue
                 key, is_file = match[1], re.search(r"\.(py|md|json|ckpt|csv|mp4|yaml|html|png|log|npy)$", word)
                 is_ours = key.split(".")[0] in {each.split(".")[0] for each in known}
-                if is_ours and not is_file and key not in known and not key.startswith("trainer.lightning."):
+                if (
+                    is_ours
+                    and not is_file
+                    and key not in known
+                    and not key.startswith(("trainer.lightning.", "hydra.searchpath"))
+                ):
                     unknown.append(f"{document.name}: {word}")
     assert not unknown
 
@@ -189,12 +234,14 @@ def test_files_and_pages_that_are_linked_are_there():
 
 
 def test_the_site_is_built_without_a_warning(tmp_path):
-    pytest.importorskip("furo")
+    for needed in ("furo", "myst_nb", "sphinx_copybutton"):
+        pytest.importorskip(needed)
     build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "method.html").is_file()
     assert "data.sample_budget" in (tmp_path / "settings.html").read_text(encoding="utf-8")
+    assert "nerf_lightning.TrainedModel" in (tmp_path / "api.html").read_text(encoding="utf-8")
 
 
 SMALLER = (

@@ -1,4 +1,4 @@
-"""Depth in metres: from a setting of the reader, through the checkpoint, to what is written."""
+"""Depth in meters: from a setting of the reader, through the checkpoint, to what is written."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, depth_range, make_shots
 
 UNIT, METRES, SIZE, TILE = 50.0, 0.01, 33, 1 << 15
-"""A unit of the scene is fifty of the capture's, which are centimetres."""
+"""A unit of the scene is fifty of the capture's, which are centimeters."""
 
 
 def record(metres_per_unit=METRES):
@@ -60,7 +60,7 @@ def test_depth_as_a_picture_is_in_millimetres_unless_it_is_too_far(tmp_path, met
     scene = record(metres)
     ImagesExport(max_views=1).export(solid(ball()), scene, tmp_path, TILE)
     said = json.loads((tmp_path / "images.json").read_text())
-    assert "in metres" in said["depth"]
+    assert "in meters" in said["depth"]
     (view, name) = next(iter(said["views"].items()))
     distance = float(scene.cameras.c2w[scene.view_names.index(view), :, 3].norm())
     expected = metres * UNIT * (distance - 0.8)

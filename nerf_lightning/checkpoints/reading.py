@@ -2,7 +2,7 @@
 
 A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
 Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
-config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learnt, where they were),
+config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learned, where they were),
 quantized (weights in fewer bytes, where it was made smaller), pixels (a hash of each photograph), and the run's state
 (`training/resume.py`).
 """
@@ -87,7 +87,7 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
         check_scene(record, "The scene")
     except Mismatch as error:
         raise InputError(
-            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Mend the capture, or "
+            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Fix the capture, or "
             "the settings (scene.*, budgets.*)."
         ) from error
     kept = vars(record) | {"cameras": dict(vars(scene.cameras))}
@@ -110,6 +110,11 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
     content = read_content(path)
     if to_resume:
         _Kept.content = _identity(path), content
+    return checkpoint_of(content, path)
+
+
+def checkpoint_of(content: dict[str, Any], path: Path) -> Checkpoint:
+    """Return the content of a checkpoint as what it says; `path` is where it lies."""
     record, prefix = content[KEY], "model."
     with reading(path, _instead_of(path)):
         state = content["state_dict"] | (dequantized(record["quantized"], str(path)) if "quantized" in record else {})

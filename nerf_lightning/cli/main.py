@@ -29,22 +29,22 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 OF_ITSELF = {
-    "completion": "Print the script with which bash, zsh or fish completes what is typed: nerf completion bash.",
-    "help": "Tell all of a setting, of a group or of an option: nerf help scene=colmap.",
+    "completion": "Print the shell completion script for bash, zsh or fish: nerf completion bash.",
+    "help": "Explain a setting, a group or an option, or search: nerf help scene=colmap.",
 }
 """Commands that explain the others."""
 VERBOSE = ("-v", "--verbose")
 DETAILS = "hydra.verbose=[nerf_lightning]"
 """What they stand for: the details that our own modules log."""
-HELP = """nerf: learn a radiance field from photographs, and render new views.
+HELP = """nerf: train radiance fields from photographs and render new views.
 
 usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
 
 {}
 
 nerf COMMAND --help lists the groups, the settings and examples of a command.
-nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene.
-nerf help WORDS looks for words: nerf help blurry, nerf help learning rate.
+nerf help NAME explains a setting, group or option: nerf help trainer.max_steps.
+nerf help WORDS searches: nerf help blurry, nerf help learning rate.
 python -m nerf_lightning is the same."""
 USAGE_ERROR = 2
 MOST_LETTERS = 5000

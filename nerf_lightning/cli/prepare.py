@@ -45,7 +45,7 @@ def _refuse_second_sweep(arguments: list[str]) -> None:
     goes_on = values.get("sweep.resume", "").lower() == "true" or was_requeued()
     if "hydra.sweep.dir" in values and not goes_on and next(folder.glob("*/run.json"), None) is not None:
         raise InputError(
-            f"{folder} already holds runs of a sweep. Add sweep.resume=true to go on with it or to add to it, or give "
+            f"{folder} already holds runs of a sweep. Add sweep.resume=true to resume it or to add to it, or give "
             "another folder with paths.output_dir=DIR."
         )
 

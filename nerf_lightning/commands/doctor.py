@@ -1,4 +1,4 @@
-"""Examine a capture before training: poses, lenses, photographs, near and far, with the cure for what is wrong."""
+"""Check a capture before training: poses, lenses, photographs, near and far, with a fix for each problem."""
 
 import time
 from collections import Counter

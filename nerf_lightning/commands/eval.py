@@ -1,4 +1,4 @@
-"""Measure a checkpoint: PSNR, SSIM, LPIPS, and depth and normals where the truth is known."""
+"""Evaluate a checkpoint: PSNR, SSIM, LPIPS, and errors of depth and normals if ground truth is known."""
 
 import torch
 from omegaconf import DictConfig

@@ -1,7 +1,8 @@
-"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page."""
+"""Export a trained scene as a page, mesh, points, splats, volume, depth maps or cameras."""
 
 import logging
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
+from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.export.base import Export, PageExtras
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say
@@ -25,8 +26,9 @@ from nerf_lightning.runs.summary import read_note, read_run
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
-from nerf_lightning.video.paths.base import CameraPath, frame_of
+from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.shots import Subject, content_of, frame_around
 from nerf_lightning.viewer.recorded_path import RecordedPath
 
 Keyframes = tuple[dict[str, Any], ...]
@@ -39,10 +41,10 @@ def run(config: DictConfig) -> None:
     on_all_processes("export", config, export)
 
 
-def export(config: DictConfig) -> None:
+def export(config: DictConfig) -> list[Path]:
     """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
     if not ranks.is_first():
-        return
+        return []
     what: Export = build(config.what)
     path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
@@ -50,20 +52,35 @@ def export(config: DictConfig) -> None:
     if what.needs_density:
         point_field(opened.model)
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
-    what.beside = beside(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
-    with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
-        record = opened.checkpoint.scene
-        if opened.model.needs_photographs:
-            record = scene_record(scene_to_look_at(opened, None))
-        written = what.export(opened.model, record, folder, opened.tile_points)
+    with filled_folder(config.paths.output_dir, default) as folder:
+        written = write_files(what, opened, photographs, path, folder)
     if opened.checkpoint.given_cameras is not None:
-        say("the cameras are those that training refined (refinement=...), not those that were read")
+        say("the cameras are the refined ones (refinement=...), not those that were read")
     say(*map(str, written))
+    return written
 
 
-def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> PageExtras:
-    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene."""
+def write_files(
+    what: Export, opened: LoadedModel, photographs: Scene | None, path: CameraPath | None, folder: Path
+) -> list[Path]:
+    """Export an opened model into a folder, which is there, and return the files."""
+    record = opened.checkpoint.scene
+    content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
+    what.beside = beside(opened.checkpoint, photographs, path if what.plays_path else None, content)
+    if opened.model.needs_photographs:
+        record = scene_record(scene_to_look_at(opened, None))
+    with torch.no_grad():
+        return what.export(opened.model, record, folder, opened.tile_points)
+
+
+def beside(
+    checkpoint: Checkpoint,
+    photographs: Scene | None,
+    path: CameraPath | None,
+    content: Content,
+) -> PageExtras:
+    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path."""
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
         ("model", checkpoint.choices.get("model", "")),
@@ -71,14 +88,19 @@ def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath |
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
-    keyframes = () if path is None else page_path(path, checkpoint.scene, run)
+    keyframes = () if path is None else page_path(path, checkpoint.scene, run, content)
     name = scene_name({"scene": checkpoint.scene.name}, checkpoint.choices, read_run(run).overrides)
     return PageExtras(photographs, corrected, tuple(known), keyframes, name)
 
 
-def page_path(path: CameraPath, record: SceneRecord, run: Path) -> Keyframes:
+def page_path(
+    path: CameraPath,
+    record: SceneRecord,
+    run: Path,
+    content: Content = PathFrame.content,
+) -> Keyframes:
     """Return the keyframes of a path; of path=auto, those that `nerf view` saved last in the run's folder, if any."""
-    around = frame_of(record.cameras, record.aabb, to_user=record.to_user, view_names=record.view_names)
+    around = frame_around(record, content)
     if not isinstance(path, AutoPath):
         return tuple(map(asdict, as_keyframes(path, around)))
     folder = run / "viewer"

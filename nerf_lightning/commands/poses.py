@@ -1,4 +1,4 @@
-"""Find the camera poses of photographs or of a video (structure from motion), so that they can be trained on.
+"""Find the cameras of photographs or of a video by structure from motion.
 
 Written is a folder that `scene=colmap` reads.
 """

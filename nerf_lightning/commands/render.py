@@ -1,4 +1,4 @@
-"""Make a video of a checkpoint along a camera path."""
+"""Render a video along a camera path."""
 
 from dataclasses import replace
 from typing import Any, cast
@@ -21,7 +21,7 @@ from nerf_lightning.video.shots import Subject
 
 
 def run(config: DictConfig) -> None:
-    """Render colour and depth."""
+    """Render color and depth."""
     on_all_processes("render", config, render)
 
 

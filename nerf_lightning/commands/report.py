@@ -1,4 +1,4 @@
-"""Write one page of a run: numbers, worst views, truth against render, curves, films, capture, protocol and config."""
+"""Write an HTML report of a run: metrics, worst views, curves, films, capture, protocol and config."""
 
 from functools import partial
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Say whether this machine computes right: kernels, precisions, trainings; a table for a bug report."""
+"""Verify kernels and numerics on this machine, with a table for bug reports."""
 
 import os
 import re

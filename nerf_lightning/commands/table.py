@@ -1,4 +1,4 @@
-"""Gather measured runs into one table: scene, model, mean and deviation over seeds, beside published numbers."""
+"""Compare runs in one table, with mean and deviation over seeds, and published results."""
 
 from pathlib import Path
 from typing import Any

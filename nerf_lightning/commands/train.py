@@ -1,4 +1,4 @@
-"""Learn a radiance field from photographs with known cameras."""
+"""Train a radiance field from photographs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ from nerf_lightning.commands.train_job.build import build_job
 from nerf_lightning.commands.train_job.fit import fit
 from nerf_lightning.commands.train_job.run_folder import held_folder
 from nerf_lightning.commands.train_job.show import show
+from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.launch.preemption import preemptible
 from nerf_lightning.training.launch.processes import on_all_processes
 
@@ -28,14 +29,18 @@ def run(config: DictConfig) -> float | None:
         return on_all_processes("train", config, lambda config: train(config).psnr)
 
 
-def train(config: DictConfig) -> Trained:
+def train(config: DictConfig, scene: Scene | None = None) -> Trained:
     """Train as the config says, in this process or as one of several: read, build, fit, measure, show.
+
+    Args:
+        config: of the run.
+        scene: one in the place of the config's.
 
     Raises:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
-    job = build_job(config)
+    job = build_job(config, scene)
     with held_folder(job, config) as folder:
         trainer = fit(job, folder)
         folder.trained(job.clock.seconds)

@@ -1,4 +1,4 @@
-"""Look around in a checkpoint, in the browser."""
+"""Explore a trained scene in the browser."""
 
 from threading import Thread
 
@@ -35,7 +35,7 @@ def run(config: DictConfig) -> None:
     photographs = Photographs(record, scene, background)
     page = Page(queue, photographs, folder, *where)
     stopped = received_stop_signals()
-    say(f"The page is at {page.address} (Ctrl-C ends it)")
+    say(f"The page is at {page.address} (Ctrl-C stops it)")
     if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with
         Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:

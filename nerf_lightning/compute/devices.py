@@ -46,13 +46,20 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
         return "mps", "as asked, untested"
     if accelerator == "tpu":
         return "xla", f"{xla_device.require_device()}, as asked"
-    if torch.cuda.is_available():
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = torch.cuda.is_available()
+    if found:
         return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
+    # Of a driver that is too old torch warns, and says how old.
+    reason = " ".join(str(told[-1].message).split())[:200].removeprefix("CUDA initialization: ") if told else ""
     if accelerator == "gpu":
         raise InputError(
-            "trainer=gpu: torch sees no CUDA device here. Use trainer=cpu or trainer=auto, or install a CUDA build "
-            "of torch and check nvidia-smi."
+            f"trainer=gpu: torch sees no CUDA device here. {reason}{' ' if reason else ''}Use trainer=cpu or "
+            "trainer=auto, or install a CUDA build of torch that suits the driver, which nvidia-smi shows."
         )
+    if reason:
+        log.warning("The CPU computes, since torch cannot use the GPU here: %s", reason)
     return "cpu", "no GPU found"
 
 
@@ -71,7 +78,7 @@ def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> 
             "there is. Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
         )
     log.warning(
-        "torch sees a GPU here, and it cannot be used: %s. The CPU computes instead; trainer=gpu insists on the GPU.",
+        "PyTorch sees a GPU, but it cannot be used: %s. The CPU is used instead; trainer=gpu insists on the GPU.",
         trouble,
     )
     return "cpu", "the GPU cannot be used"
@@ -197,6 +204,7 @@ def _quiet_libraries() -> None:
         {"message": ".*LeafSpec.*", "category": FutureWarning},
         {"message": ".*isinstance.treespec, LeafSpec.*"},
         {"message": ".*ckpt_path.*mid-epoch.*"},
+        {"message": "Total length of `list` across ranks is zero"},  # no validation views
         {"message": ".*checkpoint that ended before the epoch ended.*"},
     ]
     for rule in ignored:

@@ -39,4 +39,4 @@ def requeue() -> None:
         reason = getattr(error, "stderr", None) or error
         log.error("%s failed: %s. Submit the job again by hand; it will go on.", " ".join(command), str(reason).strip())
     else:
-        log.info("Slurm job %s is queued again and will go on from here", job)
+        log.info("Slurm job %s is queued again and will resume from here", job)

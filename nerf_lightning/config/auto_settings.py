@@ -12,6 +12,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
+from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.captures.extent import PHOTOGRAPHS, grid_for, model_for
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
@@ -32,15 +33,27 @@ TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and 32.09 dB with 1024 and 2^18.
 """
 
+GPU_BATCHES = {
+    "fast": {"data.batch_rays": 16_384, "data.sample_budget": 1 << 18},
+    "fast_proposal": {"data.batch_rays": 4_096},
+}
+"""About 2^18 samples a step, as instant-ngp takes: a GPU needs as long for a step of less, which it begins slowly."""
+
 log = logging.getLogger(__name__)
 
 
 def resolve_auto(
-    config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    scene: Scene,
+    on_gpu: bool = False,
+    former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config in which nothing is left open, and the names picked from each group.
 
-    `choices` are those picked so far, and `overrides` what the config was composed with.
+    `choices` are those picked so far, and `overrides` what the config was composed with. A run that is gone on with
+    (`former`: its config) keeps the batches that it began with, on whatever device.
 
     Raises:
         InputError: a setting that is neither a value nor auto.
@@ -52,11 +65,11 @@ def resolve_auto(
         seconds = PHOTOS_SECONDS if of_photos else None
     if choices.get("model") == AUTO:
         name, reason = model_for(scene)
-        log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
+        log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
         with_model = [*overrides, f"model={name}"]
-        fitted, picked = compose_config("train", with_model)
         if name == PHOTOGRAPHS:
-            fitted, picked = compose_config("train", [*with_model, *_for_photographs(scene, overrides, seconds)])
+            with_model += _for_photographs(scene, overrides, seconds)
+        fitted, picked = compose_config("train", [*with_model, *_for_gpu(name, overrides, on_gpu, former)])
         fitted.paths = config.paths
         config, choices = fitted, picked
     _settle(config, "doctor", of_photos)
@@ -88,11 +101,24 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
         suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
     if "loss" not in typed and scene.depths is not None:
         log.info(
-            "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
+            "loss: depth, since the distance of %s pixels is known (loss=proposal ignores it)",
             f"{len(scene.depths):,}",
         )
         suited.append("loss=depth")
     return suited
+
+
+def _for_gpu(model: str, overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None) -> list[str]:
+    """Return the batches of a model on a GPU; what a person has typed stays."""
+    batches, data = GPU_BATCHES[model], (former or {}).get("data")
+    if isinstance(data, Mapping):
+        on_gpu = data.get("batch_rays") == batches["data.batch_rays"]
+    typed = set(map(key_of, overrides))
+    larger = [f"{key}={value}" for key, value in batches.items() if key not in typed]
+    if not on_gpu or not larger:
+        return []
+    log.info("batches: about 2^18 samples a step, as suits a GPU (%s)", ", ".join(larger))
+    return larger
 
 
 def resolve_correction(
@@ -118,7 +144,7 @@ def resolve_correction(
         cause = "the run began with it" if kept else None
     picked["correction"] = "exposure" if cause else "none"
     if cause:
-        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", cause)
+        log.info("correction: exposure, since %s (correction=none leaves colors unchanged)", cause)
         config = copy.deepcopy(config)
         config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked

@@ -7,15 +7,46 @@ from typing import Any
 
 import yaml
 from hydra.utils import get_class
+from omegaconf import DictConfig
 
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.messages import in_words
+from nerf_lightning.config.overrides import flatten, quoted
 from nerf_lightning.files.folders import conf_file, option_names
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS, backend
+
+NO_EXPORTERS = ("evaluate", "video", "report")
+"""Keys of `final` that name no exporter."""
 
 
 def exporter_class(name: str) -> Any:
     """Return the class that `what=NAME` builds; None where no conf/ of ours has it, as of a person's own."""
     file = conf_file(f"what/{name}")
     return get_class(yaml.safe_load(file.read_text(encoding="utf-8"))["_target_"]) if file.is_file() else None
+
+
+def exporters_after_training(final: DictConfig) -> dict[str, Any]:
+    """Build the exporters that `final` names: `final.page=true`, or with settings `final.page.quality=small`.
+
+    Raises:
+        InputError: there is no such exporter or setting, or its value makes no sense.
+    """
+    asked = {name: value for name, value in final.items() if name not in NO_EXPORTERS and value is not False}
+    return {str(name): _exporter(str(name), value) for name, value in asked.items()}
+
+
+def _exporter(name: str, asked: Any) -> Any:
+    if asked is not True and not isinstance(asked, DictConfig):
+        raise InputError(f"final.{name}={asked}: give true, or settings as of nerf export: final.{name}.KEY=VALUE.")
+    settings = {} if asked is True else flatten(asked)
+    overrides = [f"what.{key}={quoted(value)}" for key, value in settings.items()]
+    try:
+        with in_words("export"):
+            return build(compose_config("export", [f"what={name}", *overrides])[0].what)
+    except InputError as error:
+        raise InputError(f"final.{name}: {error}") from error
 
 
 def kernel_modules() -> list[str]:

@@ -1,6 +1,6 @@
 """What settings mean, by group: one table, asked by whoever treats settings differently.
 
-Is a run of another value another run? Has a finished one of another value something left to do? Does what is learnt
+Is a run of another value another run? Has a finished one of another value something left to do? Does what is learned
 depend on it? Has it a column in a table of runs? And may a file choose it that comes from anybody, such as the saved
 overrides of a run folder or the scene that a checkpoint recorded? A group that is not in the table is trusted to nobody
 but the person at the command line; a new reader, field, loss or callback has the row of its group.
@@ -63,7 +63,7 @@ class Meaning:
     outcome: bool = True
     """What a run leaves depends on it: one that finished with another value has something left to do."""
     learnt: bool = True
-    """What is learnt depends on it: results of other values are not repetitions of one measurement."""
+    """What is learned depends on it: results of other values are not repetitions of one measurement."""
     shown: bool = True
     """It has a column in a table of runs that differ in it."""
     trust: Trust = Trust.NOTHING

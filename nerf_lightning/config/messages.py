@@ -55,12 +55,8 @@ def paragraph(error: BaseException, command: str) -> str | None:
         return (
             f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _is_out_of_memory(error)):
-        reason = " ".join(str(error).split()).partition(". ")[0] or "Python got none"
-        return (
-            f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
-            "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."
-        )
+    if isinstance(error, (MemoryError, RuntimeError)):
+        return _of_machine(error)
     if isinstance(error, OSError):
         # What is closed because of bad input may fail for the same cause, and be raised in the place of it.
         cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
@@ -71,11 +67,23 @@ def paragraph(error: BaseException, command: str) -> str | None:
     return None
 
 
-def _is_out_of_memory(error: RuntimeError) -> bool:
+def _of_machine(error: MemoryError | RuntimeError) -> str | None:
     # Imported late: it brings torch, which a config is composed without.
-    from nerf_lightning.nerf.models.tiles import is_out_of_memory
+    from nerf_lightning.nerf.models.tiles import is_device_failure, is_out_of_memory
 
-    return is_out_of_memory(error)
+    reason = " ".join(str(error).split())
+    if isinstance(error, MemoryError) or is_out_of_memory(error):
+        return (
+            f"There is no memory for this: {reason.partition('. ')[0] or 'Python got none'}. Use a smaller model or "
+            "smaller pictures, smaller tiles (trainer.tile_points), or another device (trainer=cpu); on a GPU, "
+            "nvidia-smi shows who else uses it."
+        )
+    if is_device_failure(error):
+        return (
+            f"The GPU has failed: {reason[:200]}. What was written before is whole. Try again; if it fails again, nerf "
+            "selftest tells whether the GPU computes right, and trainer=cpu does without it."
+        )
+    return None
 
 
 def _missing_plugin(message: str) -> str | None:
@@ -157,7 +165,7 @@ def _no_option(group: str, name: str) -> str | None:
     if not options:  # not ours: of a folder that hydra.searchpath names, or of a plugin
         return None
     cure = did_you_mean(name, options, f"{group}=") or f" Its options are {', '.join(options)}."
-    return f"There is no {group}={name}.{cure} nerf help {group} tells of each."
+    return f"There is no {group}={name}.{cure} nerf help {group} lists them."
 
 
 def _no_setting(name: str, value: str | None, asked: Command) -> str:

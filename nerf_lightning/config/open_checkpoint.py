@@ -94,5 +94,5 @@ def read_photographs(config: DictConfig, opened: LoadedModel) -> Scene | None:
     try:
         return as_known(build(config.scene).read(), opened)
     except (InputError, OSError) as error:
-        log.warning("The cameras are shown without their photographs: %s", error)
+        log.warning("The photographs cannot be read, so this goes without them: %s", error)
         return None

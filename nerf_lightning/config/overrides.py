@@ -9,10 +9,12 @@ from typing import Any
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.files.folders import option_names
+
 # What Hydra takes without quotes wherever it stands.
 PLAIN = re.compile(r"[\w./:@%+-]+", re.ASCII)
-OPEN_SECTIONS = re.compile(r"trainer\.lightning[.=]")
-"""Sections that take keys which our yaml files do not list."""
+OPEN_SECTIONS = re.compile(rf"(trainer\.lightning|final\.({'|'.join(option_names('what'))}))[.=]")
+"""Sections that take keys which our yaml files do not list: Lightning's arguments, and exporters by name."""
 
 
 def quoted(value: Any) -> str:
@@ -61,8 +63,8 @@ def key_of(override: str) -> str:
 def open_sections(overrides: Iterable[str]) -> list[str]:
     """Return overrides that Hydra takes for sections whose keys it does not know, without a + from the user.
 
-    >>> open_sections(["trainer.lightning.profiler=simple", "seed=1"])
-    ['++trainer.lightning.profiler=simple', 'seed=1']
+    >>> open_sections(["trainer.lightning.profiler=simple", "final.page=true", "seed=1"])
+    ['++trainer.lightning.profiler=simple', '++final.page=true', 'seed=1']
     """
     return [f"++{override}" if OPEN_SECTIONS.match(override) else override for override in overrides]
 

@@ -14,6 +14,7 @@ from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
 # Of a batch, at least: where its pixels lie, its rays, and what they should look like.
@@ -29,25 +30,24 @@ class RayDataModule(LightningDataModule):
         scene: what a reader returned.
         progress: the run's place, shared with the system.
         seed: the run's seed.
-        batch_rays: rays per training step (the batch size); the most, with a budget.
-        sample_budget: rays per step adapt, in a few fixed sizes, so that a step has about so many samples; None: they
-            do not. Steps then stay equally long once empty space is skipped, and see more rays; larger budgets make
-            them steadier and slower. It needs a model that skips empty space.
-        crop_steps: steps at the start that see only the pictures' centres.
+        batch_rays: rays per training step (the batch size); with a budget, the maximum.
+        sample_budget: the target number of samples per step, to which the number of rays adapts in a few fixed sizes;
+            None: a fixed number of rays. As empty space is skipped, steps then take equally long and see more rays;
+            larger budgets make them steadier and slower. Needs a model that skips empty space.
+        crop_steps: initial steps that see only the centers of the images.
         crop_fraction: share of each side that the crop keeps.
-        restart_crop_steps: the least crop after a restart by the collapse guard.
+        restart_crop_steps: the minimum of crop_steps after a restart by the collapse guard.
         val_rays: size of the validation subset.
-        device_budget: gigabytes of a GPU's memory that the pixels may take. Where they fit, they move there and
-            batches are made there; 0 leaves them on the host, auto takes half of what is free.
-        prefetch: make the next batch in a background thread while a step runs; auto does where that has been found to
-            help: pixels on the host and the model on a GPU, or a mapped file that memory cannot hold. The
-            batches are the same.
+        device_budget: gigabytes of GPU memory for pixels. If they fit, they are moved there and batches are made there;
+            0 keeps them on the host, auto is half of the free memory.
+        prefetch: make the next batch in a background thread while a step runs; auto: if the pixels are on the host and
+            the model on a GPU, or if a mapped file exceeds the memory. The batches are the same.
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
-        overfit_views: train on so many of the photographs, spread over all, without jitter, and validate on the same,
-            to see whether a model can learn anything at all; None: as always.
+        overfit_views: train on this number of photographs, spread over all, without jitter, and validate on them, to
+            check that a model can overfit; None: train on all.
         depth_every: one of so many rays runs through a pixel whose distance is known, as the loss wants it; 0: none.
-        views_per_step: the rays of a step are those of so many photographs, as many of each, for models that look at
-            other photographs for each that they explain; None: of all.
+        views_per_step: take the rays of a step from this number of photographs, equally many of each, for models that
+            render each photograph from others; None: from all.
     """
 
     def __init__(
@@ -91,9 +91,8 @@ class RayDataModule(LightningDataModule):
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
         _check_background(scene)
         _check_patch(scene, patch, batch_rays)
-        for split in ("train", "val"):
-            if not scene.splits.get(split):
-                raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
+        if not scene.splits.get("train"):
+            raise InputError(f"The scene {scene.name} has no train views, and training needs some.")
         if overfit_views is not None:
             scene = _few_views(scene, overfit_views)
         _check_views_per_step(views_per_step, batch_rays, sample_budget, patch, depth_every)
@@ -129,8 +128,10 @@ class RayDataModule(LightningDataModule):
         self.batches.num_steps = trainer.max_steps if counts_steps else self.batches.epoch_steps  # type: ignore[union-attr]
         return self.batches
 
-    def val_dataloader(self) -> FixedRays:
-        """Return the fixed validation rays."""
+    def val_dataloader(self) -> FixedRays | list[Batch]:
+        """Return the fixed validation rays; none of a scene without validation views, which Lightning passes over."""
+        if not self.scene.splits.get("val"):
+            return []
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
 
     def test_dataloader(self) -> WholeViews:
@@ -172,12 +173,12 @@ def _check_background(scene: Scene) -> None:
     if scene.background == "none" and scene.pixels.has_transparency:
         raise InputError(
             f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
-            "scene.background=none would train on colours without their alpha. Use white, black or random."
+            "scene.background=none would train on colors without their alpha. Use white, black or random."
         )
     if scene.background in DRAWN and not scene.pixels.has_transparency:
         log.warning(
             "scene.background=%s: the pictures of %s have no transparent pixels, so whatever lies behind the "
-            "scene is part of them and is learnt as matter. Give the background's colour instead "
+            "scene is part of them and is learned as matter. Give the background's color instead "
             "(scene.background=black or white).",
             scene.background,
             scene.name,

@@ -15,7 +15,7 @@ class DepthRays:
 
     Args:
         scene: with depths.
-        patch: side of the squares in pixels.
+        patch: side of the patches in pixels.
     """
 
     def __init__(self, scene: Scene, patch: int = 1):

@@ -1,4 +1,4 @@
-"""Training batches: a stateless, keyed order over every pixel, and one vectorised gather per batch.
+"""Training batches: a stateless, keyed order over every pixel, and one vectorized gather per batch.
 
 The order of rays is a permutation of all training pixels, new in each epoch and computed for a batch at a time; nothing
 is stored but how many rays have been seen, so a resumed run goes on exactly where it stopped.
@@ -48,7 +48,7 @@ def batch_size(largest: int, wanted: float, together: int = 1) -> int:
 
 
 class PixelDomain:
-    """The pixels of some views, or of their centres, numbered from 0; row by row, view by view.
+    """The pixels of some views, or of their centers, numbered from 0; row by row, view by view.
 
     Where pixels are to come in squares, the squares are numbered instead. They lie on a grid that may be shifted
     against the picture; at its borders they are moved inside, so that together they hold every pixel wherever the grid
@@ -57,7 +57,7 @@ class PixelDomain:
     Args:
         scene: the views' sizes, and where they lie.
         views: which views take part, in order.
-        fraction: share of each side, around the centre, that takes part; 1 for the whole picture.
+        fraction: share of each side, around the center, that takes part; 1 for the whole picture.
         patch: side of the squares in pixels, no longer than any picture's.
     """
 
@@ -114,7 +114,7 @@ class PixelDomain:
 
 
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
-    """Return colours and weights of pixels."""
+    """Return colors and weights of pixels."""
     store, mask = scene.pixels, scene.pixels.mask
     kernels = cuda_backend("pixels.cuda", store.rgba.device)
     if kernels is not None:
@@ -172,7 +172,7 @@ class RayBatches:
         self.depths = depths if depths is not None and len(depths) else None
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
-        """See only the pictures' centres at first; without this, runs on white backgrounds may never start learning.
+        """See only the pictures' centers at first; without this, runs on white backgrounds may never start learning.
 
         The crop is a domain of its own and counts no epoch.
 
@@ -305,7 +305,7 @@ class FixedRays:
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "
-                "Raise data.val_rays, or check the masks of the validation views (scene.masks_keep says which colour "
+                "Raise data.val_rays, or check the masks of the validation views (scene.masks_keep says which color "
                 "counts)."
             )
 

@@ -21,7 +21,8 @@ NARROW, WIDE, WIDEST = 12.0, 100.0, 140.0
 OFF_CENTER, FAR_OFF_CENTER = 0.06, 0.2
 FEW, TOO_FEW = 15, 5
 FEW_MATCHES = 30
-# Degrees between a held-out view and the nearest one that is learnt from.
+STEP = 10.0  # Degrees between neighbors of a good ring of photographs.
+# Degrees between a held-out view and the nearest one that is learned from.
 FAR_HELD_OUT = 40.0
 
 
@@ -30,17 +31,17 @@ def rigid(evidence: Given) -> Check:
     c2w = evidence.scene.cameras.c2w
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
     if bad:
-        cure = "Take scale and mirror out of the rotations; the centres keep them."
+        cure = "Take scale and mirror out of the rotations; the centers keep them."
         return wrong(f"{evidence.named(bad)} have poses that are no rotations", cure)
     size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
-        cure = "Walk around: depth is seen only from different places. Or the centres were lost in the conversion."
-        return wrong("all cameras stand at one place", cure)
+        cure = "Walk around: depth is seen only from different places. Or the centers were lost in the conversion."
+        return wrong("all cameras are at the same position", cure)
     same = (torch.pdist(c2w.flatten(1)) < 1e-6 * size).sum() if len(c2w) <= 2000 else torch.tensor(0)
     if int(same):
         cure = "Look for photographs that are listed twice, or poses that were copied."
         return look(f"{int(same)} pairs of views have one and the same pose", cure)
-    return ok(f"all {len(c2w)} poses are right-handed rotations with different centres")
+    return ok(f"all {len(c2w)} poses are right-handed rotations with different centers")
 
 
 def common_middle(evidence: Given) -> Check:
@@ -53,16 +54,16 @@ def common_middle(evidence: Given) -> Check:
     to_middle = focus_point(c2w) - c2w[:, :, 3]
     ahead = float(((to_middle * -c2w[:, :, 2]).sum(dim=-1) > 0).double().mean())
     if ahead >= 0.8:
-        return ok(f"{100 * ahead:.0f} % of the cameras have the place where their axes meet in front")
+        return ok(f"{100 * ahead:.0f} % of the cameras face their common focus point")
     if ahead <= 0.2:
         cure = (
-            "If the photographs show one thing from around, negate the second and third column of every rotation; if "
-            "they were taken outwards from one place, all is well."
+            "If the photographs surround one object, negate the second and third column of every rotation; if they "
+            "look outward from one position, the poses are right."
         )
-        message = f"{100 * (1 - ahead):.0f} % of the cameras look away from the place where their axes meet"
+        message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
-    cure = "Look at doctor.png: do the cameras face what was photographed? If not, see the check of axes."
-    return look(f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
+    cure = "See doctor.png: the cameras should face what was photographed. If not, see the check of axes."
+    return look(f"only {100 * ahead:.0f} % of the cameras face a common focus point", cure)
 
 
 def upright(evidence: Given) -> Check:
@@ -102,12 +103,12 @@ def field_of_view(evidence: Given) -> Check:
 
 
 def principal_point(evidence: Given) -> Check:
-    """Judge how far the principal point lies from the photograph's centre; a halved one is named."""
+    """Judge how far the principal point lies from the photograph's center; a halved one is named."""
     cameras = evidence.scene.cameras
     size = torch.stack([cameras.width, cameras.height], dim=-1)
     share = cameras.center / size
     off = float((share - 0.5).abs().max())
-    message = f"at most {100 * off:.1f} % of the size from the centre"
+    message = f"at most {100 * off:.1f} % of the size from the center"
     if off < OFF_CENTER:
         return ok(message)
     usual = share.median(dim=0).values
@@ -121,7 +122,7 @@ def principal_point(evidence: Given) -> Check:
 
 
 def lens(evidence: Given) -> Check:
-    """Judge how strongly the lens bends towards the corners; one that folds is refused when the capture is read."""
+    """Judge how strongly the lens bends toward the corners; one that folds is refused when the capture is read."""
     cameras = evidence.scene.cameras
     if cameras.lens_model == "pinhole" or not bool(cameras.lens.any()):
         return ok("no distortion")
@@ -151,12 +152,12 @@ def number_of_views(evidence: Given) -> Check:
 
 
 def splits(evidence: Evidence) -> Check:
-    """Judge whether views are held out, and not learnt from as well."""
+    """Judge whether views are held out, and not learned from as well."""
     parts = {split: set(views) for split, views in evidence.scene.splits.items()}
     both = sorted(parts["train"] & (parts["val"] | parts["test"]))
     if both:
         cure = "Take them out of one of the two lists; else the scores say nothing of new views."
-        return wrong(f"{evidence.named(both)} are learnt from and held out at once", cure)
+        return wrong(f"{evidence.named(both)} are learned from and held out at once", cure)
     held = sorted(parts["val"] | parts["test"])
     angles = _degrees_to_nearest(evidence.scene, held, sorted(parts["train"]))
     lonely = [view for view, angle in zip(held, angles.tolist(), strict=True) if angle > FAR_HELD_OUT]
@@ -196,15 +197,20 @@ def coverage(evidence: Evidence) -> Check:
     """Report from where around the middle photographs were taken; a hole in a ring of views is noted."""
     scene = evidence.scene
     if scene.space == "ndc":
-        return ok("forward-facing: new views are good between the cameras, not beside them")
+        return ok("forward-facing: new views are good between the cameras, not outside them")
     azimuth, elevation = directions_seen(scene)
     around, gaps = gaps_around(azimuth)
     widest = float(gaps.max())
     up = f"heights of {float(elevation.min()):.0f} to {float(elevation.max()):.0f} degrees"
     message = f"seen from {360 - widest:.0f} degrees around, from {up}"
     if len(gaps) > 8 and 50 < widest < 140:
-        at = float(around[int(gaps.argmax())] + widest / 2)
-        cure = f"Photographs are missing around {(at + 180) % 360 - 180:.0f} degrees (see doctor.png); take some there."
+        place = int(gaps.argmax())
+        at = (float(around[place]) + widest / 2 + 180) % 360 - 180
+        before, after = (scene.view_names[view] for view in azimuth.argsort().roll(-place)[:2].tolist())
+        cure = (
+            f"Take {math.ceil(widest / STEP)} more photographs between where {before} and {after} were taken, around "
+            f"{at:.0f} degrees on the coverage map."
+        )
         return look(f"{message}, with a gap of {widest:.0f} degrees", cure)
     return ok(message)
 

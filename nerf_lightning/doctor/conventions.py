@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.doctor.matches import Matches
-from nerf_lightning.nerf.geometry.frames import points_to_user, unit_of
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
@@ -23,13 +22,6 @@ class Reading:
     """What the capture looks like, as the rest of "the poses look ..."."""
     cure: str
     change: Callable[[Scene, Matches], tuple[Float[Tensor, "views 3 4"], Matches]]
-
-
-def user_poses(scene: Scene) -> Float[Tensor, "views 3 4"]:
-    """Return the poses in the user's own frame (float64): what an inversion must be done in."""
-    to_user, c2w = scene.to_user.double(), scene.cameras.c2w.double()
-    centers = points_to_user(c2w[:, :, 3], to_user)
-    return torch.cat([to_user[:3, :3] / unit_of(to_user) @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
 
 
 def inverted(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
@@ -64,13 +56,13 @@ def numeric_order(cameras: Cameras, names: tuple[str, ...]) -> Tensor:
 
 
 def _poses(change: Callable[[Tensor], Tensor]) -> Callable[[Scene, Matches], tuple[Tensor, Matches]]:
-    return lambda scene, matches: (change(user_poses(scene)), matches)
+    return lambda scene, matches: (change(scene.user_cameras.c2w), matches)
 
 
 def _pictures(x: float, y: float) -> Callable[[Scene, Matches], tuple[Tensor, Matches]]:
     # Mirrored about the principal point: good enough to tell.
     return lambda scene, matches: (
-        user_poses(scene),
+        scene.user_cameras.c2w,
         replace(matches, plane=matches.plane * matches.plane.new_tensor([x, y])),
     )
 
@@ -93,7 +85,7 @@ AXES = (
         _poses(lambda c2w: inverted(axes(c2w, FLIP_YZ))),
     ),
     Reading(
-        "as if their rotations were transposed", "Transpose every rotation, leave the centres.", _poses(transposed)
+        "as if their rotations were transposed", "Transpose every rotation, leave the centers.", _poses(transposed)
     ),
     Reading(
         "as if their rotations were transposed, with OpenCV's axes",
@@ -125,7 +117,7 @@ ORDERS = (
     Reading(
         "as if they followed the numbers in the photographs' names, and not the names sorted as text",
         "Pair photographs and poses in numeric order (rename 1.jpg to 0001.jpg and so on).",
-        lambda scene, matches: (user_poses(scene)[numeric_order(scene.cameras, scene.view_names)], matches),
+        lambda scene, matches: (scene.user_cameras.c2w[numeric_order(scene.cameras, scene.view_names)], matches),
     ),
     Reading("as if each photograph had the pose of the next one", SHIFT, _poses(lambda c2w: c2w.roll(-1, 0))),
     Reading("as if each photograph had the pose of the previous one", SHIFT, _poses(lambda c2w: c2w.roll(1, 0))),

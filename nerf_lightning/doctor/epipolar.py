@@ -22,7 +22,7 @@ def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.
 def line_distances(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Float[Tensor, "matches 2"]:
     """Return how far each place lies from the line that the other's ray draws, in pixels of the shrunk pictures.
 
-    With D, E the rays and b the way between the centres, the plane of b and E cuts the other picture in a line (the
+    With D, E the rays and b the way between the centers, the plane of b and E cuts the other picture in a line (the
     epipolar line). Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9. Arguments as in `agreeing`.
     """
     rays, between = rays_of(matches, c2w, zoom)
@@ -72,7 +72,7 @@ def rays_of(
 
 
 def _nearest(rays: Float[Tensor, "matches 2 3"], between: Float[Tensor, "matches 3"]) -> Float[Tensor, "matches 2"]:
-    # s, t that minimise |s first - t second - between|.
+    # s, t that minimize |s first - t second - between|.
     first, second = rays.unbind(dim=1)
     cosine = (first * second).sum(dim=-1)
     along, across = (first * between).sum(dim=-1), (second * between).sum(dim=-1)

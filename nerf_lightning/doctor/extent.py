@@ -19,7 +19,7 @@ FEWEST = 50
 FEW, MANY = 0.03, 0.15
 # Of each view, a grid of GRID x GRID pixels is looked at.
 GRID = 12
-UNITS = {"inches": 39.37, "feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
+UNITS = {"inches": 39.37, "feet": 3.281, "centimeters": 100.0, "millimeters": 1000.0}
 
 
 def near_and_far(evidence: Evidence) -> Check:
@@ -35,7 +35,7 @@ def near_and_far(evidence: Evidence) -> Check:
         if before <= FEW:
             return ok(f"{100 * (1 - before):.0f} % of the content lies beyond the near plane (NDC)")
         return (wrong if before > MANY else look)(
-            f"{100 * before:.0f} % of the content lies before the near plane of the normalised device coordinates",
+            f"{100 * before:.0f} % of the content lies before the near plane of the normalized device coordinates",
             f"Set scene.near to about {0.9 * float(distance.quantile(0.01)) * unit:.3g} (it is {unit:.3g}).",
         )
     before = float((distance < scene.near[view]).float().mean())
@@ -76,7 +76,7 @@ def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
 
 
 def box_in_view(evidence: Evidence) -> Check:
-    """Judge whether every view's rays meet the box that is modelled, between near and far."""
+    """Judge whether every view's rays meet the box that is modeled, between near and far."""
     scene = evidence.scene
     if scene.space != "bounded":
         return ok(f"space is {scene.space}: no box bounds the content")
@@ -86,7 +86,7 @@ def box_in_view(evidence: Evidence) -> Check:
     if not blind:
         return ok(message)
     cure = (
-        "The cameras do not look at the box, or near and far miss it: check the axes of the poses, centre the capture "
+        "The cameras do not look at the box, or near and far miss it: check the axes of the poses, center the capture "
         "on its content, or set near, far and the box (scene.aabb_half)."
     )
     message += f"; {len(blind)} views miss it, such as {evidence.named(blind[:3])}"
@@ -94,21 +94,21 @@ def box_in_view(evidence: Evidence) -> Check:
 
 
 def scale(evidence: Evidence) -> Check:
-    """Judge the size of the capture against what is modelled."""
+    """Judge the size of the capture against what is modeled."""
     scene = evidence.scene
     centers = scene.cameras.c2w[:, :, 3]
     middle = scene.aabb.mean(dim=0)
     away = float((centers - middle).norm(dim=-1).median())
     half = float((scene.aabb[1] - scene.aabb[0]).max()) / 2
     if scene.space != "bounded":
-        return ok(f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours")
+        return ok(f"rescaled internally: one unit is {unit_of(scene.to_user.double()):.3g} capture units")
     inside = ((centers > scene.aabb[0]) & (centers < scene.aabb[1])).all(dim=-1)
     message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
     if bool(inside.float().mean() > 0.3):
         cure = "Make the scene larger than the box or the box smaller (scene.aabb_half), or use scene.space=contracted."
         return wrong(message + ": they stand within it", cure)
     if away > 30 * half:
-        cure = "Scale the camera centres down, or make the box larger (scene.aabb_half), with near and far to match."
+        cure = "Scale the camera centers down, or make the box larger (scene.aabb_half), with near and far to match."
         return wrong(message + ": the content would be a dot in their pictures", cure)
     return _content_in_box(evidence, message)
 
@@ -146,9 +146,9 @@ def _units(low: float, high: float, near: float, far: float) -> str:
     off = f"they are {max(factor, 1 / factor):.3g} times too {'large' if factor > 1 else 'small'}."
     for name, size in UNITS.items():
         if abs(factor / size - 1) < 0.35:
-            return f" Near and far may be in {name} and the poses in metres: {off}"
+            return f" Near and far may be in {name} and the poses in meters: {off}"
         if abs(factor * size - 1) < 0.35:
-            return f" Near and far may be in metres and the poses in {name}: {off}"
+            return f" Near and far may be in meters and the poses in {name}: {off}"
     return ""
 
 

@@ -1,6 +1,6 @@
-"""What photographs look like: corners, described so that neighbouring photographs have them too, and a few numbers.
+"""What photographs look like: corners, described so that neighboring photographs have them too, and a few numbers.
 
-The corners are upright and of one scale: made for neighbours, of which a part may well fail, and not for structure from
+The corners are upright and of one scale: made for neighbors, of which a part may well fail, and not for structure from
 motion.
 """
 
@@ -37,11 +37,11 @@ class Corners:
     """What was found in one picture, the clearest first."""
 
     at: Float[Tensor, "corners 2"]
-    """x and y in pixels of the shrunk picture; pixel centres at +0.5."""
+    """x and y in pixels of the shrunk picture; pixel centers at +0.5."""
     descriptor: Float[Tensor, "corners dims"]
     """Unit length."""
     rgb: Float[Tensor, "corners 3"]
-    """Mean colour around the corner, in [0, 1]."""
+    """Mean color around the corner, in [0, 1]."""
 
 
 def shrunk_cameras(cameras: Cameras) -> Cameras:
@@ -52,7 +52,7 @@ def shrunk_cameras(cameras: Cameras) -> Cameras:
 
 
 def small_picture(pixels: PixelStore, view: int, width: int, height: int) -> Float[Tensor, "3 height width"]:
-    """Return a view's colours (0 to 1) at another size; what is transparent or masked is middle grey."""
+    """Return a view's colors (0 to 1) at another size; what is transparent or masked is middle gray."""
     rgba = pixels.view(view).float().permute(2, 0, 1) / 255
     cover = rgba[3]
     kept = pixels.kept(view)
@@ -63,7 +63,7 @@ def small_picture(pixels: PixelStore, view: int, width: int, height: int) -> Flo
 
 
 def brightness(picture: Float[Tensor, "3 *places"]) -> Float[Tensor, "*places"]:
-    """Return the luma of colours (Rec. 601)."""
+    """Return the luma of colors (Rec. 601)."""
     return (picture.movedim(0, -1) @ picture.new_tensor([0.299, 0.587, 0.114])).contiguous()
 
 
@@ -79,7 +79,7 @@ def find_corners(picture: Float[Tensor, "3 height width"], most: int = MOST_CORN
     value, index = torch.where(peak & inside, clear, 0.0).flatten().topk(min(most, clear.numel()))
     index = index[value > LEAST_CLEAR]
     x, y = index % grey.shape[1], index // grey.shape[1]
-    # The top of a parabola through the peak and its neighbours lies between the pixels.
+    # The top of a parabola through the peak and its neighbors lies between the pixels.
     shift = torch.stack([_top(*(clear[y, x + k] for k in (-1, 0, 1))), _top(*(clear[y + k, x] for k in (-1, 0, 1)))])
     at = torch.stack([x, y], dim=-1) + 0.5 + shift.T
     return Corners(at, _described(gx[0], gy[0], at), _blurred(picture, 2.0)[:, y, x].T)
@@ -148,7 +148,7 @@ class Looks:
     """One row per view of the scene."""
 
     thumbnail: Float[Tensor, "views side side"]
-    """Brightness, on middle grey where transparent or masked."""
+    """Brightness, on middle gray where transparent or masked."""
     fineness: Float[Tensor, "views directions"]
     """How fine the detail is, however much of it there is: see `fineness_of`."""
     kept: Float[Tensor, "views"]
@@ -156,9 +156,9 @@ class Looks:
     covered: Float[Tensor, "views"]
     """Mean alpha."""
     border: Float[Tensor, "views 3"]
-    """Median colour of the picture's edge."""
+    """Median color of the picture's edge."""
     border_even: Float[Tensor, "views"]
-    """Share of the edge's pixels that have this colour, to two levels."""
+    """Share of the edge's pixels that have this color, to two levels."""
     faint: Float[Tensor, "views 2"]
     """How many nearly transparent pixels are brighter than half of their alpha: up to alpha, and beyond."""
 

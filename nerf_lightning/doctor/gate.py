@@ -35,14 +35,14 @@ def require_sound(scene: Scene) -> list[Check]:
     if wrong:
         first, others = wrong[0], ", ".join(check.name for check in wrong[1:])
         raise InputError(
-            f"The capture {scene.name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}"
-            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all that it sees, in a picture; "
-            "doctor=off trains all the same."
+            f"The capture {scene.name} cannot be trained on. {first.name}: {first.message}. {first.cure}"
+            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all findings, with a figure; "
+            "doctor=off trains anyway."
         )
     unknown = [check.name for check in checks if check.verdict == "not judged"]
     left = f"; not judged: {', '.join(unknown)}" if unknown else ""
     count = len(checks) - len(unknown)
-    log.info("doctor: %d checks find nothing wrong%s (doctor=off leaves them out)", count, left)
+    log.info("doctor: %d checks found no problem%s (doctor=off skips them)", count, left)
     return checks
 
 
@@ -71,7 +71,7 @@ def warn_of_faults(scene: Scene) -> None:
 
 
 def _nothing(pixels: PixelStore, view: int) -> str | None:
-    """Return what is there in the place of a picture: one colour, or nothing at all; None: a picture."""
+    """Return what is there in the place of a picture: one color, or nothing at all; None: a picture."""
     rgba, kept = pixels.view(view), pixels.kept(view)
     for step in (max(1, len(rgba) // ROWS), 1):
         part = rgba[::step].reshape(-1, 4) if kept is None else rgba[::step][kept[::step]]

@@ -15,10 +15,10 @@ from nerf_lightning.nerf.rendering.blending import at_evaluation
 SAME = 0.012
 # So many views nearby are compared with; fewer say nothing.
 NEIGHBORS, FEWEST_NEIGHBORS = 6, 4
-# A photograph is blurred that has less than this share of its neighbours' fine detail; within these bounds the share
+# A photograph is blurred that has less than this share of its neighbors' fine detail; within these bounds the share
 # depends on how much photographs differ anyway: so many deviations.
 SOFT, SOFTEST, DEVIATIONS = 0.5, 0.27, 4.5
-# Pixels that tell whether colours are multiplied by alpha, and the share of them that may be brighter all the same.
+# Pixels that tell whether colors are multiplied by alpha, and the share of them that may be brighter all the same.
 FAINT, STRAY = 100, 0.005
 # Factors of brightness and of red or blue against green.
 EXPOSURE, TINT = 1.35, 1.2
@@ -36,7 +36,7 @@ def duplicates(evidence: Evidence) -> Check:
     parts = torch.arange(len(flat)).split(rows_at_once(len(flat)))
     same = torch.cat([_pairs_alike(flat, contrast, part) for part in parts])
     if not len(same):
-        return ok("no photograph is there twice")
+        return ok("no duplicate photographs")
     scene = evidence.scene
     held = set(scene.splits["test"]) | set(scene.splits["val"])
     leak = [pair for pair in same.tolist() if (pair[0] in held) != (pair[1] in held)]
@@ -75,13 +75,13 @@ def blur(evidence: Evidence) -> Check:
     if hidden := fineness.isnan().any(dim=1).nonzero()[:, 0].tolist():
         least += f" ({evidence.named(hidden)} show too little texture to tell)"
     if not bad:
-        return ok(f"the softest of {len(shown)} photographs has {least}")
+        return ok(f"the least sharp of {len(shown)} photographs has {least}")
     message = f"{len(bad)} of {len(shown)} are blurred: {evidence.named(bad)}; the worst has {least}"
     return look(message, "Remove them (scene.frames, or from the file), or photograph again.")
 
 
 def exposure(evidence: Evidence) -> Check:
-    """Compare the colours of the same details in different photographs."""
+    """Compare the colors of the same details in different photographs."""
     matches = evidence.matches
     if evidence.agreement > 0.3:
         matches = matches.where(evidence.agrees)
@@ -125,7 +125,7 @@ def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | Non
 
 
 def transparency(evidence: Evidence) -> Check:
-    """Judge alpha, and whether colours were multiplied by it already."""
+    """Judge alpha, and whether colors were multiplied by it already."""
     scene, looks = evidence.scene, evidence.looks
     if not scene.pixels.has_transparency:
         return ok("the photographs are opaque")
@@ -135,25 +135,25 @@ def transparency(evidence: Evidence) -> Check:
         message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
         return look(message, "See that alpha was exported, or remove these views.")
     up_to, beyond = looks.faint.sum(dim=0).tolist()
-    # Cutting out leaves the colours as they were.
+    # Cutting out leaves the colors as they were.
     if "cut_out" not in scene.protocol and up_to + beyond < FAINT:
         needs = f"It needs {FAINT} pixels that are nearly transparent; of hard outlines there is nothing to multiply."
-        return not_judged(f"{covered}; whether colours are multiplied by alpha cannot be seen", needs)
+        return not_judged(f"{covered}; whether colors are multiplied by alpha cannot be seen", needs)
     multiplied = "cut_out" not in scene.protocol and beyond <= STRAY * up_to
     if multiplied and at_evaluation(scene.background) not in ("black", "none"):
         message = f"of {up_to + beyond:.0f} nearly transparent pixels {beyond:.0f} are brighter than alpha"
-        return look(f"{message}: colours are multiplied by alpha", "Export straight alpha, or edges get dark seams.")
+        return look(f"{message}: colors are multiplied by alpha", "Export straight alpha, or edges get dark seams.")
     return ok(f"{covered}, the rest is transparent")
 
 
 def baked_background(evidence: Evidence) -> Check:
-    """Look for a background of one colour that opaque photographs have, or had, baked in."""
+    """Look for a background of one color that opaque photographs have, or had, baked in."""
     scene, looks = evidence.scene, evidence.looks
     if color := scene.protocol.get("cut_out"):
         message = f"plain {color}, which was made transparent (scene.cut_out)"
         if color in COLOURS and at_evaluation(scene.background) != color:
             cure = (
-                f"Outlines keep the colour that they were photographed before: set scene.background={color}_or_random."
+                f"Outlines keep the color that they were photographed before: set scene.background={color}_or_random."
             )
             return look(f"{message}; scene.background is {scene.background}", cure)
         return ok(message)
@@ -162,7 +162,7 @@ def baked_background(evidence: Evidence) -> Check:
         return ok(f"{scene.background}, behind what the photographs show")
     colour = looks.border[even].median(dim=0).values
     usual = [known for known, level in COLOURS.items() if float((colour - level).abs().max()) < 0.03]
-    words = usual[0] if usual else "of the colour " + ", ".join(f"{255 * float(level):.0f}" for level in colour)
+    words = usual[0] if usual else "of the color " + ", ".join(f"{255 * float(level):.0f}" for level in colour)
     if usual == [scene.background]:
         return ok(f"the photographs are opaque on {words}, and so is the scene's background")
     cure = (

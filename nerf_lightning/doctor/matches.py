@@ -33,7 +33,7 @@ class Matches:
     focal: Float[Tensor, "matches 2"]
     """Focal length of each, in pixels of the shrunk pictures."""
     rgb: Float[Tensor, "matches 2 3"]
-    """Colour around the place in each."""
+    """Color around the place in each."""
     views: tuple[int, ...]
     """The views that were looked at: all, or of very many some."""
 

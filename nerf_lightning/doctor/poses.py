@@ -108,7 +108,7 @@ def single_poses(evidence: Evidence) -> Check:
     if 2 * judged < len(matches.views):
         return not_judged(f"only {found}", MORE_DETAILS)
     if not bad:
-        return ok(f"{found}, and agree with their neighbours (least {least:.0%})")
+        return ok(f"{found}, and agree with their neighbors (least {least:.0%})")
     others = [view for view in range(len(c2w)) if view not in bad]
     doubted = [view for view in bad if not is_vouched_for(evidence, view, others)]
     if not doubted:
@@ -153,7 +153,7 @@ def _proof_of(evidence: Evidence, pose: BetterPose) -> tuple[Proof, ...]:
 def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
     """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
 
-    They are found one at a time; the matches of each are left out from then on, so that its neighbours do not suffer
+    They are found one at a time; the matches of each are left out from then on, so that its neighbors do not suffer
     for it. `good` are the matches that lie where the cameras say.
     """
     shares, largest = shares_of_views(matches, good, num_views)
@@ -207,7 +207,7 @@ def fitting_pose(
     own = matches.where((matches.view == view).any(dim=1))
     best, best_share = None, least
     for other in suspects:
-        # A match with the view whose camera is tried says nothing: the centres would coincide.
+        # A match with the view whose camera is tried says nothing: the centers would coincide.
         free = own.where(~(own.view == other).any(dim=1))
         if other == view or len(free.view) < 20:
             continue
@@ -232,7 +232,7 @@ def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -
     if shares[best] < max(given + BETTER, HOPELESS):
         if given < HOPELESS:
             return not_judged("too few details lie where the cameras say, by any reading", DOUBTFUL)
-        return ok(f"{fine}: no other reading fits the pixels better")
+        return ok(f"{fine}: no other convention fits the images better")
     poses, changed = readings[best].change(scene, evidence.matches)
     fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None
     against = agreeing(changed, poses) & ~evidence.agrees

@@ -1,4 +1,4 @@
-"""A second opinion on a view that its neighbours contradict: only a pose that fits better proves that its own is wrong.
+"""A second opinion on a view that its neighbors contradict: only a pose that fits better proves that its own is wrong.
 
 Details that repeat, stripes around a can and outlines that slide over a smooth surface make matches that contradict
 right poses, too. They give themselves away: no other pose explains them, or the views that stand nearest agree.

@@ -38,16 +38,16 @@ class Scoring:
 
     Args:
         split: train, val or test.
-        max_views: most views, evenly spread over the split; None for all.
-        quantize: round the render to 8 bits first, as a saved picture would be.
-        num_pictures: how many views keep their pictures, evenly spread.
-        num_worst: how many more, those of the lowest PSNR.
+        max_views: maximum number of views, evenly spread over the split; None: all.
+        quantize: round renders to 8 bits first, as in a saved image.
+        num_pictures: number of views whose images are kept, evenly spread.
+        num_worst: number of further views with the lowest PSNR.
         lpips_weights: a file with the backbone's weights; None: LPIPS is not computed.
         lpips_net: the backbone, alex or vgg.
-        colors: raw compares renders as they are; half_fit gives each the exposure and white balance that suit the left
-            half of its photograph, and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
-        nearest_views: of a model that renders from photographs: also measure what so many of them give without it, each
-            view shown as the nearest of them and as their blend; null: no.
+        colors: raw compares renders unchanged; half_fit fits exposure and white balance to the left half of each
+            photograph and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
+        nearest_views: for models that render from photographs: also evaluate baselines without a model from this number
+            of photographs: the nearest one, and their blend; null: no.
     """
 
     split: Literal["train", "val", "test"] = "test"

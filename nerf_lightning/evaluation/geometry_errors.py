@@ -39,8 +39,8 @@ def normal_error(
 ) -> float | None:
     """Return the mean angle in degrees between unit normals; None if no pixel can be scored.
 
-    A pixel counts if it and its four neighbours are wholly covered by the scene (`alpha` 1): the differences
-    that make its normal then touch no background. The border, which lacks a neighbour, does not count.
+    A pixel counts if it and its four neighbors are wholly covered by the scene (`alpha` 1): the differences
+    that make its normal then touch no background. The border, which lacks a neighbor, does not count.
     """
     covered, inside = alpha >= 1.0, torch.zeros_like(alpha, dtype=torch.bool)
     above_and_below = covered[:-2, 1:-1] & covered[2:, 1:-1]

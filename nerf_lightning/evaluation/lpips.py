@@ -1,7 +1,7 @@
 """LPIPS (arXiv 1801.03924, version 0.1) in plain torch, on a backbone whose weights the user brings.
 
 The usual packages need torchvision and a download at run time; this needs neither. Our layers carry the names
-of torchvision's state dict; the learnt weights of the channels lie in torchmetrics' package.
+of torchvision's state dict; the learned weights of the channels lie in torchmetrics' package.
 """
 
 from importlib.resources import as_file, files
@@ -61,7 +61,7 @@ class LPIPS(nn.Module):
     def forward(
         self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
     ) -> Float[Tensor, ""]:
-        """Return the distance of two pictures with colours in [0, 1]: 0 for equal ones, seldom above 1."""
+        """Return the distance of two pictures with colors in [0, 1]: 0 for equal ones, seldom above 1."""
         features = torch.stack([render, truth]).movedim(-1, 1).clamp(0, 1) * 2 - 1
         features = (features - self.shift) / self.scale
         distance, level = features.new_zeros(()), 0
@@ -101,7 +101,7 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
 
 
 def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:
-    """Return the learnt weight of each channel of each compared layer."""
+    """Return the learned weight of each channel of each compared layer."""
     source = files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
     with as_file(source) as path:
         state = load_tensors(path)

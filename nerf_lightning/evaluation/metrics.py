@@ -29,7 +29,7 @@ def masked_out(
     truth: Float[Tensor, "height width 3"],
     kept: Bool[Tensor, "height width"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return the render with the truth's colours where a pixel is not kept, so that no difference is found there."""
+    """Return the render with the truth's colors where a pixel is not kept, so that no difference is found there."""
     return render if kept is None else torch.where(kept[..., None], render, truth)
 
 
@@ -41,8 +41,8 @@ def image_metrics(
 ) -> dict[str, float | None]:
     """Return `psnr` (dB), `cc_psnr` and `ssim` of one image; the render is clamped to [0, 1] first.
 
-    `cc_psnr` is the PSNR after an affine fit of the render's colours to the photograph's (`color_fit`), so that neither
-    exposure nor white balance counts. It is None where either is of one colour: a fit then says nothing.
+    `cc_psnr` is the PSNR after an affine fit of the render's colors to the photograph's (`color_fit`), so that neither
+    exposure nor white balance counts. It is None where either is of one color: a fit then says nothing.
 
     SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
     is None where the image is smaller than the window: with another window it would be another metric.
@@ -51,7 +51,7 @@ def image_metrics(
         render: the picture to judge.
         truth: the photograph.
         kept: pixels that count, at least one; None: all. PSNR is that of these pixels. For SSIM, which looks at
-            neighbours, the others take the photograph's colours.
+            neighbors, the others take the photograph's colors.
     """
     render = masked_out(render.clamp(0, 1), truth, kept)
     fits = not (is_one_color(render, kept) or is_one_color(truth, kept))
@@ -105,7 +105,7 @@ def _columns(per_image: Sequence[dict[str, float | None]]) -> dict[str, list[flo
 
 
 class RayErrors:
-    """Collect squared errors of rays, batch by batch, and summarise them over all processes of a run."""
+    """Collect squared errors of rays, batch by batch, and summarize them over all processes of a run."""
 
     def __init__(self) -> None:
         self.parts: list[Tensor] = []

@@ -45,7 +45,7 @@ def measured_how(
 ) -> dict[str, Any]:
     """Return the protocol of a measurement.
 
-    A background that is drawn in training means its colour at evaluation; `quantize`: the render was rounded to 8 bits;
+    A background that is drawn in training means its color at evaluation; `quantize`: the render was rounded to 8 bits;
     `lpips` is the backbone, None where LPIPS is not computed.
     """
     sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
@@ -60,7 +60,7 @@ def measured_how(
         "colors": COLORS[colors],
         "masks": "none" if scene.pixels.mask is None else "left out",
         "psnr": "mean of the pictures' own",
-        "cc_psnr": "after an affine fit of each picture's colours, by least squares",
+        "cc_psnr": "after an affine fit of each picture's colors, by least squares",
         "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
         "lpips": None if lpips is None else f"{lpips}, version 0.1",
         **scene.protocol,
@@ -108,7 +108,7 @@ def measured_of(
 
 
 def config_hash(settings: Any) -> str:
-    """Return a fingerprint of the settings that decide what is learnt: equal for runs that differ by their seed alone.
+    """Return a fingerprint of the settings that decide what is learned: equal for runs that differ by their seed alone.
 
     >>> config_hash({"seed": 0, "optimizer": {"lr": 1}}) == config_hash({"seed": 1, "optimizer": {"lr": 1}})
     True

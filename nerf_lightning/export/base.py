@@ -18,7 +18,7 @@ class PageExtras:
     photographs: Scene | None = None
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
     corrected: bool = False
-    """Whether the model learnt what each camera makes of its colours, which then are not the photographs'."""
+    """Whether the model learned what each camera makes of its colors, which then are not the photographs'."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
     keyframes: tuple[dict[str, Any], ...] = ()
@@ -28,7 +28,7 @@ class PageExtras:
 
 
 class Export(ABC):
-    """Write what a model has learnt as files for other programs."""
+    """Write what a model has learned as files for other programs."""
 
     needs_photographs: bool = False
     """Whether the photographs of the run are read again, and stand in `beside`; None there: they cannot be."""
@@ -63,10 +63,10 @@ def require_setting(name: str, value: object, good: bool, rule: str) -> None:
 
 
 def refuse_ndc(record: SceneRecord, what: str) -> None:
-    """Refuse a scene whose field lives in normalised device coordinates."""
+    """Refuse a scene whose field lives in normalized device coordinates."""
     if record.space == "ndc":
         raise InputError(
-            f"what={what}: {record.name} was trained in normalised device coordinates (scene.space=ndc), where far "
+            f"what={what}: {record.name} was trained in normalized device coordinates (scene.space=ndc), where far "
             "things have no box. Use what=points or what=images, or train again with scene.space=contracted."
         )
 

@@ -40,7 +40,7 @@ class CamerasExport(Export):
     """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the pictures of the training.
 
     Args:
-        images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
+        images: folder of the photographs, relative to the JSON file, prefixed to each name; None: the recorded names.
     """
 
     needs_density = False

@@ -41,12 +41,12 @@ class ImagesExport(Export):
 
     Each channel of the model's field has a folder of float32 .npy arrays.
 
-    Where the capture's unit is known, depth is in metres, and the PNG in millimetres as depth cameras write it, unless
+    Where the capture's unit is known, depth is in meters, and the PNG in millimeters as depth cameras write it, unless
     something lies further away than these reach.
 
     Args:
-        split: whose views are shown.
-        max_views: most of them, spread over all; None: all.
+        split: the split whose views are exported.
+        max_views: maximum number of views, spread over all; None: all.
         depth: `distance` along the pixel's ray, or `z` along the camera's axis.
     """
 
@@ -90,7 +90,7 @@ class ImagesExport(Export):
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
         write_json(about, self._described(record, names, scale))
-        said = "millimetres" if in_millimetres else f"{scale:.4g} of these"
+        said = "millimeters" if in_millimetres else f"{scale:.4g} of these"
         say(f"depth        in {told_length(record)[1]}; a step of the 16-bit PNG is {said}")
         return [depths, opacities, directions, *channels.values(), about]
 

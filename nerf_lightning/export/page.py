@@ -28,7 +28,7 @@ RESOLUTIONS: dict[Space, dict[Quality, int]] = {
     "ndc": {"small": 128, "medium": 216, "large": 320},
     "contracted": {"small": 108, "medium": 160, "large": 192},
 }
-# and spherical harmonics of its colours: without bounds much is fog, which hides less what changes with the direction.
+# and spherical harmonics of its colors: without bounds much is fog, which hides less what changes with the direction.
 HARMONICS: dict[Space, dict[Quality, int]] = {
     "bounded": {"small": 4, "medium": 4, "large": 9},
     "ndc": {"small": 4, "medium": 4, "large": 9},
@@ -43,18 +43,18 @@ class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
     Args:
-        quality: about 3, 10 or 30 MB.
-        resolution: voxels along the longest side of what there is; in scenes without bounds three quarters of them lie
-            along the side of the box, and as many around it. None: as the quality has it.
-        photographs: most photographs that are places to jump to, spread over all; 0: none.
-        max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
-        fit_steps: so many steps move the bytes towards the photographs that the model learnt from; 0: they stay as
-            baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
-        title: what the page is called; None: as the scene, or as its folder where it is named by its format alone.
-        views: file of named views, notes and distances (`page_marks`), which is then kept as `views.json` next to the
-            page; None: the one that lies there, if any.
-        first_view: name of a view of that file, or of a photograph, with which the page begins; None: the training
-            view nearest to their average.
+        quality: small, medium or large: about 3, 10 or 30 MB.
+        resolution: voxels along the longest side of the content; in unbounded scenes, three quarters of them lie along
+            the side of the box, and as many around it. None: as the quality.
+        photographs: maximum number of photographs to jump to, spread over all; 0: none.
+        max_views: maximum number of test views on which the page is compared with the model; 0: none.
+        fit_steps: steps that fit the voxels to the training photographs; 0: as baked, as also without photographs, or
+            if the model has a correction per photograph.
+        title: title of the page; None: the scene's name, or its folder's if the name is only that of its format.
+        views: file of named views, notes and distances (see `page_marks`), which is kept as `views.json` next to the
+            page; None: that file, if it exists.
+        first_view: name of the view or photograph that is shown first; None: the training photograph nearest to the
+            average of all.
     """
 
     needs_photographs = True

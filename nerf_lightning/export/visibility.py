@@ -17,7 +17,7 @@ from nerf_lightning.nerf.models.render_image import picture_surface, render_pict
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 # Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals; and
-# where rays go through normalised device coordinates.
+# where rays go through normalized device coordinates.
 STRAIGHT, BENT = 250, 370
 
 

@@ -9,7 +9,7 @@ ANOTHER = "The checkpoint is damaged, or made by somebody else: use another one.
 
 
 class InputError(Exception):
-    """Report something that the user can mend.
+    """Report a problem that the user can fix.
 
     The command line prints the message as one paragraph and exits with code 2; no traceback. The message names
     what is wrong, where (file, key, value), and what to do about it.

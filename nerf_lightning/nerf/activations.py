@@ -1,4 +1,4 @@
-"""From a network's raw numbers to density and colour; kernels of whole rays compute the same, with these numbers."""
+"""From a network's raw numbers to density and color; kernels of whole rays compute the same, with these numbers."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ LARGEST_RAW = 30.0
 LARGEST_SLOPE_RAW = 15.0
 """Beyond it the slope of the density grows (or, below its negative, falls) no further."""
 LEAST_SLOPE = 0.003
-"""Of a colour over its raw value, on the way back from black or full: what it is at a colour of 0.003 or 0.997. With
+"""Of a color over its raw value, on the way back from black or full: what it is at a color of 0.003 or 0.997. With
 alpha, which teaches density what is empty, there is no need, and Lego loses 0.08 dB by it."""
 
 
@@ -39,9 +39,9 @@ class _TruncatedExponential(torch.autograd.Function):
 
 
 class _Sigmoid(torch.autograd.Function):
-    """1 / (1 + exp(-x)), with a way back from black and from full colours, where it has no slope left.
+    """1 / (1 + exp(-x)), with a way back from black and from full colors, where it has no slope left.
 
-    Where nearly all pixels are black, all colours are within ten steps (1e-38), and what the few pixels of the content
+    Where nearly all pixels are black, all colors are within ten steps (1e-38), and what the few pixels of the content
     ask for would be multiplied by as little. What leads farther out keeps the true slope: as steep, it would carry the
     weights away to no end, at a cost of 6 dB on photographs with dark corners.
     """

@@ -11,7 +11,7 @@ LEAST_MSE = 1e-10
 
 
 def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
-    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; at most 100.
+    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colors in [0, 1]; at most 100.
 
     Equal pictures (a view of background alone) would have an infinite one, and no mean or file could hold it.
 

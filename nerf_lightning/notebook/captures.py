@@ -13,24 +13,24 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 def read(capture: str | os.PathLike[str] | None = None, *, scene: str = "auto", **settings: Any) -> Scene:
-    """Read a capture: photographs, cameras, and where the content lies.
+    """Read a capture: photographs, cameras and bounds.
 
-    `nl.read("data/fox")` recognises COLMAP, nerfstudio, instant-ngp, Blender and LLFF by their files;
-    `nl.read("photographs", scene="photos")` finds the cameras first, and `nl.read(scene="bricks")` makes the embedded
-    scene.
+    `nl.read("data/fox")` recognizes COLMAP, nerfstudio, instant-ngp, Blender, LLFF and others by their files;
+    `nl.read("photographs", scene="photos")` finds the cameras first, and `nl.read(scene="bricks")` generates the
+    embedded scene.
 
     Args:
-        capture: the capture's folder, or an .npz file; None for a scene that the program makes.
-        scene: the format by its name in `conf/scene/`; auto: the files tell.
-        **settings: of the scene, as `nerf help scene=...` lists them: `downscale=2`, `background="white"`.
+        capture: the capture's folder, or an .npz file; None for a generated scene.
+        scene: the format by its name in `conf/scene/`; auto: recognized by its files.
+        **settings: settings of the scene, as `nerf help scene=...` lists them: `downscale=2`, `background="white"`.
 
     Returns:
-        Cameras (one per view; axes right, up, back; pixels) and the near and far of each view in scene units;
-        `scene.pixels.view(i)` is view i, uint8 of height x width x 4 with straight alpha; `scene.to_user` takes scene
-        coordinates to the capture's own.
+        Cameras (one per view; axes right, up, back; pixels) and near and far of each view in scene units.
+        `scene.pixels.view(i)` is view i, uint8 of height x width x 4 with straight alpha; `scene.to_user` transforms
+        scene coordinates to the capture's own.
 
     Raises:
-        InputError: the capture or a setting is not as it must be; the message says what to do.
+        InputError: the capture or a setting is invalid; the message says how to fix it.
     """
     given = dict(settings)
     if capture is not None:

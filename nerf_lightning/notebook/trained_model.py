@@ -2,13 +2,16 @@
 
 import os
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
-from nerf_lightning.checkpoints.recorded_frame import as_trained
-from nerf_lightning.config.compose import compose_config
+from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.commands.export import export as export_checkpoint
+from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.open_checkpoint import open_checkpoint
@@ -17,77 +20,83 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
-from nerf_lightning.video.shots import Subject, lay_path, shot_of
+from nerf_lightning.video.shots import Subject, content_of, lay_path, shot_of
 
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A model with its weights, on its device, in evaluation mode, and what it knows of its capture."""
+    """A trained model on its device, in evaluation mode, with the cameras of its capture."""
 
     module: Model = field(repr=False)
-    """The network: a torch module that takes rays."""
+    """The network: a PyTorch module that renders rays."""
     checkpoint: Checkpoint = field(repr=False)
-    """The file as read: config, choices, step, precision."""
+    """The checkpoint: config, chosen options, step, precision."""
     tile_points: int
-    """Most points that go through a field at once."""
+    """Maximum number of points that go through a field at once."""
 
     @property
     def scene(self) -> SceneRecord:
-        """Cameras (those that training has refined, where it did), bounds, splits and names; no photographs."""
+        """Cameras (refined ones, if training refined them), bounds, splits and names, without photographs."""
         return self.checkpoint.scene
 
     def render(self, camera: Cameras | int | str, background: str | None = None) -> Picture:
-        """Render what a camera sees.
+        """Render the view of a camera.
 
         Args:
-            camera: one camera in the frame of `self.scene` (`scene.cameras[3]`, `self.path("orbit")[0]`), or the
-                number or the name of one of its views.
+            camera: one camera in the user's own frame (of `Cameras.from_opencv`, `scene.user_cameras[3]` of any reading
+                of the capture, `model.path("orbit")[0]`), or the number or the name of a view of `model.scene`.
             background: what lies behind the scene: white, black or none; None: as in training.
 
         Returns:
             On the CPU: `rgb` (height x width x 3, sRGB in [0, 1] up to rounding), `depth` (height x width, the expected
-            distance along each pixel's ray in scene units; light that escapes ends at far), `opacity` (height x width).
+            distance along each pixel's ray in the user's units; light that escapes ends at far), `opacity` (height x
+            width).
 
         Raises:
-            InputError: there is no such view or background, or several cameras were given.
+            InputError: unknown view or background, or several cameras.
         """
         with torch.no_grad(), in_words("render"):
-            behind = known_background(background or self.scene.background)
+            scene, behind = self.scene, known_background(background or self.scene.background)
             if isinstance(camera, Cameras):
-                subject = Subject(self.module, self.scene, behind)
-                return shot_of(subject, _one(camera), self.tile_points).picture(0)
-            scene, view = self.scene, self._view(camera)
-            rays_of = RayGenerator.of_views(scene, self.module)
-            return render_picture(self.module, rays_of, view, behind, self.tile_points)
+                one = _one(camera)
+                c2w = poses_from_user(one.c2w.double().cpu(), scene.to_user).float()
+                shot = shot_of(Subject(self.module, scene, behind), replace(one.to("cpu"), c2w=c2w), self.tile_points)
+                picture = shot.picture(0)
+            else:
+                rays_of = RayGenerator.of_views(scene, self.module)
+                picture = render_picture(self.module, rays_of, self._view(camera), behind, self.tile_points)
+            return replace(picture, depth=unit_of(scene.to_user) * picture.depth)
 
     def path(self, name: str = "orbit", **settings: Any) -> Cameras:
-        """Return the cameras of a camera path around the capture, in order of time, to be rendered one by one.
+        """Return the cameras of a path around the capture, in its own frame, one per frame.
 
         Args:
-            name: of the path, in `conf/path/`: orbit, spiral, keyframes, ...
-            **settings: of the path, as `nerf help render path=...` lists them, in the capture's own frame and units:
-                `num_frames=40`, `width=320`.
+            name: a path in `conf/path/`: orbit, spiral, keyframes, ...
+            **settings: settings of the path, as `nerf help render path=...` lists them, in the capture's own frame and
+                units: `num_frames=40`, `width=320`.
 
         Raises:
-            InputError: an unknown path or setting, or the path cannot be laid around this capture.
+            InputError: unknown path or setting, or the path does not suit this capture.
         """
         overrides = [f"path={name}", *(f"path.{key}={quoted(value)}" for key, value in settings.items())]
         with in_words("render"):
             config, _ = compose_config("render", overrides)
-            return lay_path(build(config.path), self.scene)
+            subject = Subject(self.module, self.scene, self.scene.background)
+            cameras = lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
+            return replace(self.scene, cameras=cameras).user_cameras
 
     def of_scene(self, scene: Scene) -> "TrainedModel":
-        """Return the same network for another scene, which it renders from the photographs of that scene from now on.
+        """Return the same network for another scene, from whose photographs it then renders.
 
-        For models that look at photographs, which have to be shown some before they render; of
-        several captures that were joined, the first that was never trained on is taken.
+        For models of many scenes. If several captures were joined, the first one that was held out is used.
 
         Raises:
-            InputError: the model knows its own scene alone, or cannot look at these photographs.
+            InputError: the model knows only its own scene, or cannot render from these photographs.
         """
         if not self.module.needs_photographs:
             raise InputError(f"This model knows the scene {self.scene.name} alone, and no other can be shown to it.")
@@ -95,15 +104,28 @@ class TrainedModel:
         show_photographs(self.module, shown)
         return replace(self, checkpoint=replace(self.checkpoint, scene=scene_record(shown), given_cameras=None))
 
-    def in_frame(self, scene: Scene) -> Scene:
-        """Return a scene in the frame of this model, with its refined cameras where it has some.
+    def export(self, what: str, folder: str | os.PathLike[str] | None = None, **settings: Any) -> list[Path]:
+        """Write files for other programs, as `nerf export` does: `model.export("splats", format="spz")`.
 
-        A capture that is read with other settings (`frames`, `downscale`) may have another working frame.
+        The checkpoint is read again, in float32, and so are the photographs of its run where the exporter needs them.
+
+        Args:
+            what: the exporter, of `conf/what/`: mesh, points, splats, page, ...
+            folder: where to; None: the folder `export` of the run.
+            **settings: of the exporter, as `nerf help export what=mesh` lists them.
+
+        Returns:
+            The files.
 
         Raises:
-            InputError: it was read with another `space` than the model was trained in.
+            InputError: an unknown exporter or setting, or a model in which there is nothing to export.
         """
-        return as_trained(scene, self.checkpoint)
+        if self.module.needs_photographs:
+            raise InputError("This model renders from photographs: give those to nerf export with scene=....")
+        overrides = [f"ckpt={quoted(self.checkpoint.path)}", f"what={what}", f"paths.output_dir={quoted(folder)}"]
+        overrides += [f"what.{key}={quoted(value)}" for key, value in settings.items()]
+        with in_words("export"), composed_job("export", prepared("export", overrides)) as config:
+            return export_checkpoint(config)
 
     def _view(self, camera: int | str) -> int:
         names = self.scene.view_names
@@ -118,7 +140,7 @@ class TrainedModel:
 
 
 def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
-    """Open a trained model: the newest checkpoint of a run folder, or a checkpoint, whoever wrote it.
+    """Load a trained model from the newest checkpoint of a run folder, or from a checkpoint.
 
     Nothing in the file is executed, and the capture is not needed.
 
@@ -127,7 +149,7 @@ def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
         *overrides: settings of the machine, as on the command line: "trainer=cpu", "trainer.tile_points=4096".
 
     Raises:
-        InputError: it is no checkpoint of this program, or is damaged.
+        InputError: the file is not a checkpoint of this package, or is damaged.
     """
     with in_words("render"):
         config, _ = compose_config("render", [f"ckpt={quoted(run)}", *overrides])

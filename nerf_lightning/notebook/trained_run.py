@@ -13,6 +13,8 @@ from nerf_lightning.config.messages import in_words
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.notebook.run import of_scene
 from nerf_lightning.notebook.trained_model import TrainedModel, load
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.processes import num_processes
@@ -23,38 +25,40 @@ class TrainedRun:
     """A finished run."""
 
     folder: Path
-    """The run folder: checkpoints, pictures, TensorBoard's files, the film."""
+    """The run folder: checkpoints, images, TensorBoard files, the film."""
     psnr: float | None
-    """Mean PSNR of the test views in dB; the validation's where no evaluation was asked for."""
+    """Mean PSNR of the test views in dB; of the validation rays if `final.evaluate=false`."""
     metrics: dict[str, Any]
-    """The content of metrics.json: the mean of each metric, `per_image`, and how it was measured (`protocol`); empty
-    where no evaluation was asked for."""
+    """The content of metrics.json: the mean of each metric, `per_image`, and the `protocol`; empty if
+    `final.evaluate=false`."""
     model: TrainedModel
-    """As its last checkpoint has it."""
+    """The model of its last checkpoint."""
 
 
-def train(*overrides: str) -> TrainedRun:
+def train(*overrides: str, scene: Scene | None = None) -> TrainedRun:
     """Train as `nerf train` does, in this process, and return the run.
 
     `nl.train("scene=blender", "scene.root=data/lego", "model=fast", "trainer.max_steps=800")` takes the overrides of
-    the command line, `resume=auto` and `paths.output_dir=DIR` among them. Ctrl-C, or the notebook's stop button, ends
-    the run after the step, with a checkpoint to go on from.
+    the command line, including `resume=auto` and `paths.output_dir=DIR`. Ctrl-C, or the notebook's stop button, ends
+    the run after the current step, with a checkpoint to resume from.
 
     Args:
-        *overrides: settings, each as one text.
+        *overrides: settings, one string each.
+        scene: from `Scene.from_cameras` or `nl.read`, instead of the config's.
 
     Raises:
-        InputError: anything in the settings or in the capture that makes no run; nothing is left half-written.
+        InputError: a setting or the capture is invalid; nothing is left half-written.
         KeyboardInterrupt: the run was stopped; its checkpoint is saved.
     """
-    with in_words("train"), composed_job("train", prepared("train", list(overrides))) as config:
+    with in_words("train"), composed_job("train", prepared("train", list(of_scene(scene, overrides)))) as config:
         set_limits(Budgets(**config.budgets))
         _require_one_process(config.trainer)
         try:
-            done = train_in_folder(config)
+            done = train_in_folder(config, scene)
         except SystemExit as stop:
             raise KeyboardInterrupt(f"The training was stopped (exit code {stop.code}).") from None
-    metrics = read_json_object(done.folder / FILES["run"]) if config.final.evaluate else {}
+    measured = done.folder / FILES["run"]
+    metrics = read_json_object(measured) if config.final.evaluate and measured.is_file() else {}
     of_the_machine = ("trainer=", "trainer.accelerator=", "trainer.num_threads=")
     model = load(done.folder, *(each for each in overrides if each.startswith(of_the_machine)))
     return TrainedRun(done.folder, done.psnr, metrics, model)

@@ -21,7 +21,7 @@ FORMATS = {
     "seconds": "{:.3f}",
 }
 LABELS = {
-    "cc_psnr": "PSNR, colours fitted",
+    "cc_psnr": "PSNR, colors fitted",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "depth_error": "depth error, scene units",

@@ -36,6 +36,8 @@ class Report:
     subtitle: str = ""
     scene_page: str = ""
     """The address of the page on which the scene can be walked around in."""
+    exports: Pairs = field(default_factory=list)
+    """Files for other programs: label and address."""
     facts: Pairs = field(default_factory=list)
     """The numbers on top: label and value."""
     missing: list[str] = field(default_factory=list)
@@ -43,7 +45,7 @@ class Report:
     worst: list[ViewOnPage] = field(default_factory=list)
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
-    """Pictures of one view while it was learnt."""
+    """Pictures of one view while it was learned."""
     curves: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)

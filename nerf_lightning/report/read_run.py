@@ -25,9 +25,8 @@ from nerf_lightning.runs.summary import read_run as read_summary
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
-SCENE_PAGES = ("page.html", "export/page.html")
-"""Of a run folder: where final.page and nerf export write the page of its scene."""
-VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learnt"}
+MOST_EXPORTS = 20
+VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learned"}
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
 
 
@@ -48,10 +47,7 @@ def read_run(
         folder: where the page will lie; None: in the run folder.
     """
     report = Report(title=run.absolute().name)
-    pages = [file for place in SCENE_PAGES if (file := run / place).is_file() and is_page(file)]
-    if pages:
-        newest = max(pages, key=lambda file: file.stat().st_mtime)
-        report.scene_page = address_from(newest.absolute(), (folder or run).absolute())
+    _add_exports(report, run / "export", (folder or run).absolute())
 
     @contextmanager
     def attempt(what: str) -> Iterator[None]:
@@ -96,6 +92,17 @@ def address_from(file: Path, folder: Path) -> str:
     """
     # Behind a dot, no name is taken for a scheme such as javascript.
     return f"./{quote(os.fsencode(Path(os.path.relpath(file, folder)).as_posix()))}"
+
+
+def _add_exports(report: Report, exported: Path, folder: Path) -> None:
+    """Link what nerf export wrote; of pages, only ours."""
+    files = [file for file in sorted(exported.glob("*")) if file.is_file() and file.suffix != ".html"]
+    for file in files[:MOST_EXPORTS]:
+        size = f"{file.stat().st_size / 1e6:.2g} MB"
+        report.exports.append((f"{file.name} ({size})", address_from(file.absolute(), folder)))
+    page = exported / "page.html"
+    if page.is_file() and is_page(page):
+        report.scene_page = address_from(page.absolute(), folder)
 
 
 def _add_measured(report: Report, run: Path, file: Path) -> None:

@@ -234,7 +234,7 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
         if resuming:
             return
         raise InputError(
-            f"{folder} already holds a run of this very config. Add resume=auto to go on with it, or give another "
+            f"{folder} already contains a run with these settings. Add resume=auto to resume it, or give another "
             "folder with paths.output_dir=DIR."
         )
     other = _former_identity(folder)

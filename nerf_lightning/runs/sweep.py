@@ -70,7 +70,7 @@ class SweepWatch(Callback):
             leftover.unlink(missing_ok=True)
         record.write(sweep.folder)
         if "sweep" in config:
-            said = f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}"
+            said = f"sweep folder {sweep.folder}; after a stop, resume with: {sweep.go_on_with()}"
             print(for_terminal(said), file=sys.stderr)
         # Optuna's database library lists its parts.
         logging.getLogger("alembic").setLevel(logging.WARNING)
@@ -126,7 +126,7 @@ def _end() -> list[JobRecord]:
     write_markdown(rows, sweep.folder / "sweep.md")
     say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
-        say(f"go on with   {sweep.go_on_with()}")
+        say(f"resume with  {sweep.go_on_with()}")
     return records
 
 
@@ -198,7 +198,7 @@ def _pass_signals_on(sweep: Sweep) -> None:
             raise KeyboardInterrupt
         sweep.received = number
         stop_file(sweep.folder).touch()
-        log.info("stopping: the jobs that run finish their step and save")
+        log.info("stopping: running jobs finish their step and save")
         for record in read_records(sweep.folder):
             if record.state == "running" and psutil.pid_exists(record.process):
                 os.kill(record.process, signal.SIGTERM)

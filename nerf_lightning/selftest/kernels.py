@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, CUDA_BACKENDS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
@@ -35,7 +35,7 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
 
     The others (Adam, carving, search, where rays become opaque) are part of the trainings that `training` compares.
     """
-    names, library = (("hash_grid.cuda", "mlp.cuda"), "triton") if device.type == "cuda" else (CPU_BACKENDS, "numba")
+    names, library = (CUDA_BACKENDS, "triton") if device.type == "cuda" else (CPU_BACKENDS, "numba")
     face = "the share of rays of which a midpoint lies on a cell's face to the last bits: about 1 in 1000"
     sums = f"sums of at most {PACKED_SAMPLES} terms, whose transmittances are exponentials of such sums"
     found = [
@@ -118,7 +118,7 @@ def _of_ray(samples: RaggedSamples, ray: int) -> list[list[float]]:
 
 
 def _packed_samples() -> tuple[Tensor, Tensor, RaggedSamples, RaggedSamples]:
-    """Return densities, colours, samples, and the same in float64."""
+    """Return densities, colors, samples, and the same in float64."""
     random, counts = _generator(), torch.arange(RAYS) % (PACKED_SAMPLES + 1)
     index = torch.repeat_interleave(torch.arange(RAYS), counts)
     bounds = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])

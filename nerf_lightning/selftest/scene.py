@@ -1,4 +1,4 @@
-"""The scene of the self-test: a ball whose colour is its normal, traced on the spot."""
+"""The scene of the self-test: a ball whose color is its normal, traced on the spot."""
 
 import torch
 

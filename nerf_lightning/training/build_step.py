@@ -34,7 +34,7 @@ def build_step(
     Args:
         config: of the run.
         settings: of the machine.
-        scene: what is learnt.
+        scene: what is learned.
         progress: the run's place.
         start: the checkpoint whose weights it begins with.
         model: one in the place of the config's.
@@ -51,7 +51,7 @@ def build_step(
     refinement.fit_to(scene)
     if model.needs_photographs and refinement.moves():
         raise InputError(
-            "A model that looks at photographs takes their cameras as they are, so nothing is learnt of them: leave "
+            "A model that looks at photographs takes their cameras as they are, so nothing is learned of them: leave "
             "refinement out. Refine the cameras of a capture with a model of its own (model=fast)."
         )
     scene = replace(scene, refined=refinement.moves())

@@ -48,10 +48,10 @@ class WeightsAndBiases(RunLogger):
     """Curves, settings and pictures in a project of Weights & Biases; a resumed run goes on in its page there.
 
     Args:
-        project: the project that the run appears in; it is made where it is missing.
-        entity: the user or the team that has it; None: your own.
-        offline: keep everything in the run folder (`wandb/`), for `wandb sync`; the variable WANDB_MODE=offline does
-            the same.
+        project: the project of the run; it is created if it is missing.
+        entity: the user or team of the project; None: your own.
+        offline: keep everything in the run folder (`wandb/`), for `wandb sync`; the environment variable
+            WANDB_MODE=offline does the same.
 
     Raises:
         InputError: wandb is not installed.
@@ -96,9 +96,9 @@ class MLflow(RunLogger):
     """Curves, settings and pictures in an experiment of MLflow; each start of a run is a run of its own there.
 
     Args:
-        experiment: the experiment that the run appears in; it is made where it is missing.
-        tracking_uri: the server, or a database such as sqlite:///mlflow.db; None: the variable MLFLOW_TRACKING_URI,
-            else the file `mlflow.db` of the run folder.
+        experiment: the experiment of the run; it is created if it is missing.
+        tracking_uri: the server, or a database such as `sqlite:///mlflow.db`; None: the environment variable
+            MLFLOW_TRACKING_URI, otherwise `mlflow.db` in the run folder.
 
     Raises:
         InputError: mlflow is not installed.

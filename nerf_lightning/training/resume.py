@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.loops import _FitLoop, _PredictionLoop
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nerf_lightning.checkpoints.format import KEY, require_training_state
+from nerf_lightning.checkpoints.format import KEY, LOOPS, require_training_state
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import use_threads
 from nerf_lightning.data.ray_batches import batch_sizes
@@ -42,6 +43,23 @@ def run_state(step: TrainStep) -> dict[str, Any]:
         "num_threads": torch.get_num_threads(),
         "world_size": ranks.world_size(),
     }
+
+
+def loops_after(steps: int) -> dict[str, Any]:
+    """Return what Lightning's loops keep in the midst of a run's one epoch, after so many steps."""
+    no_trainer: Any = None
+    fit: Any = _FitLoop(no_trainer)
+    epoch, optimizer_steps = fit.epoch_loop, fit.epoch_loop.manual_optimization.optim_step_progress
+    evaluation = epoch.val_loop.state_dict()
+    epoch._batches_that_stepped = steps
+    for epochs in (fit.epoch_progress.total, fit.epoch_progress.current):
+        epochs.ready = epochs.started = 1
+    for batches in (epoch.batch_progress.total, epoch.batch_progress.current):
+        batches.ready = batches.started = batches.processed = batches.completed = steps
+    for taken in (optimizer_steps.total, optimizer_steps.current):
+        taken.ready = taken.completed = steps
+    states = fit.state_dict(), evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
+    return dict(zip(LOOPS, states, strict=True))
 
 
 def restore_run(state: Mapping[str, Any], step: TrainStep, device: torch.device) -> None:

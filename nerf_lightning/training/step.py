@@ -23,7 +23,7 @@ from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.losses.mse import MeanSquaredError, squared_error
+from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
@@ -82,18 +82,18 @@ class TrainStep:
     Args:
         model: what learns.
         rays: makes the rays through a batch's pixels.
-        loss: one number per level; their sum is minimised.
+        loss: one number per level; their sum is minimized.
         optimizer: takes the parameters.
         schedule: factor on the learning rate as a function of the attempt's step.
         progress: the run's place; it is changed here, and read by the loader.
         seed: the run's seed.
         background: what lies behind the training rays.
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
-        clip_norm: gradients are scaled down to this norm; None leaves them.
+        clip_norm: maximum norm of the gradient, to which larger ones are scaled down; None: no clipping.
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
-        correction: what photographs make of the rendered colours; None leaves them alone.
+        correction: what photographs make of the rendered colors; None leaves them alone.
         jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
             evaluation, so that steps differ in their pixels alone.
 
@@ -236,7 +236,7 @@ class TrainStep:
             return self.build_optimizer(groups)
         except (ValueError, TypeError) as error:  # torch looks at its settings here
             raise InputError(
-                f"The optimizer refuses its settings: {error}. Mend optimizer.*, or leave it out."
+                f"The optimizer refuses its settings: {error}. Fix optimizer.*, or leave it out."
             ) from error
 
     def __call__(
@@ -289,7 +289,7 @@ class TrainStep:
         """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
 
         Args:
-            batch: pixels, colours, weights.
+            batch: pixels, colors, weights.
             backward: adds a loss's gradients to the parameters'.
             share: what part of the step's batch this is; None: all of it.
 
@@ -404,12 +404,9 @@ class TrainStep:
             terms = self.loss(shown, target[tile]) | _penalties(renderings)
             levels = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
             part = (tile.stop - tile.start) / share.num_rays
+            with torch.no_grad():
+                errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
             terms = {name: values.detach() for name, values in terms.items()}
-            if type(self.loss) is MeanSquaredError:
-                errors = terms["color"]  # the same
-            else:
-                with torch.no_grad():
-                    errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
             if part < 1.0:
                 levels, errors = levels * part, errors * part
                 terms = {name: values * part for name, values in terms.items()}
@@ -444,9 +441,7 @@ class TrainStep:
             ) from error
         points = batch.num_rays * self.model.points_per_ray(training=True)
         self.tile_points = int(min(self.tile_points, points)) // 2
-        log.warning(
-            "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
-        )
+        log.warning("out of memory: reducing tiles to %d points and repeating the step", self.tile_points)
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         """Return how many of so many pixels are rendered at once."""

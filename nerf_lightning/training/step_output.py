@@ -14,15 +14,15 @@ class StepOutput(TensorStruct):
     """What a step saw of its rays, and what it lost there; detached. Callbacks find it as `outputs["step"]`."""
 
     losses: Float[Tensor, "levels"]
-    """Of the whole batch, over all processes; their sum was minimised, with the penalties of parts."""
+    """Of the whole batch, over all processes; their sum was minimized, with the penalties of parts."""
     terms: dict[str, Float[Tensor, "levels"]]
     """The same by term of the loss."""
     color_errors: Float[Tensor, "levels"]
-    """Mean squared errors of the levels' colours, over all processes; a level without colour has a meaningless one."""
+    """Mean squared errors of the levels' colors, over all processes; a level without color has a meaningless one."""
     foreground: Float[Tensor, "rays 3"]
     """The last level's light, without the background's; of this process's rays, like all that follows."""
     rgb: Float[Tensor, "rays 3"]
-    """The last level's colours, as they were compared with `target`."""
+    """The last level's colors, as they were compared with `target`."""
     target: Float[Tensor, "rays 3"]
     weight: Float[Tensor, "rays"]
     """0 for masked pixels."""

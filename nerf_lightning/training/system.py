@@ -31,7 +31,7 @@ from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 class RadianceFieldSystem(LightningModule):
     """Train a radiance field on ray batches with Lightning.
 
-    A step cuts its batch into tiles whose gradients add up, hence the optimisation is manual. What a step returns
+    A step cuts its batch into tiles whose gradients add up, hence the optimization is manual. What a step returns
     reaches callbacks as `outputs["step"]` of `on_train_batch_end` (`StepOutput`).
 
     Args:
@@ -119,7 +119,7 @@ class RadianceFieldSystem(LightningModule):
         """Compare a whole view with its photograph, and return and log `psnr`, `cc_psnr` (dB) and `ssim`.
 
         The means over the views, `test/psnr` and so on, are those of `nerf eval`, which looks at more: geometry, LPIPS,
-        and, where cameras were learnt, how those of the test views have to move.
+        and, where cameras were learned, how those of the test views have to move.
 
         Raises:
             InputError: the batch is no whole view.
@@ -133,7 +133,7 @@ class RadianceFieldSystem(LightningModule):
         return known
 
     def predict_step(self, batch: Batch, batch_index: int) -> Picture:
-        """Render a whole view: colour, depth in scene units, opacity.
+        """Render a whole view: color, depth in scene units, opacity.
 
         Raises:
             InputError: the batch is no whole view.
@@ -159,10 +159,12 @@ class RadianceFieldSystem(LightningModule):
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
                 "Go on from it with a smaller optimizer.lr, or add gradient clipping (trainer.clip_norm=1)."
             )
-        checkpoint[KEY] = self.record | run_state(self.step)
+        checkpoint[KEY] = self.kept_record()
+
+    def kept_record(self) -> dict[str, Any]:
+        """Return what makes a checkpoint self-contained, and the run's state beyond weights and optimizer."""
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
-        if refined is not None:
-            checkpoint[KEY]["refined"] = dict(vars(refined))
+        return self.record | run_state(self.step) | ({} if refined is None else {"refined": dict(vars(refined))})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check what Lightning is about to restore, and restore the rest of the run.

@@ -25,8 +25,8 @@ class OrderedTensorBoard(TensorBoardLogger):
 
     Args:
         save_dir: the run folder.
-        name: the folder of its files, in the run folder.
-        version: a folder in that one, for these files alone; empty: none.
+        name: the folder of the files, in the run folder.
+        version: a folder in that one; empty: none.
         purge_step: the first step that is forgotten of what an earlier start wrote.
     """
 

@@ -29,7 +29,7 @@ class TileLoss(TensorStruct):
     terms: dict[str, Float[Tensor, "levels"]]
     """The same by term, detached."""
     errors: Float[Tensor, "levels"]
-    """Each level's mean squared error of colour, whatever its loss is; of one that shows none it means nothing."""
+    """Each level's mean squared error of color, whatever its loss is; of one that shows none it means nothing."""
     foreground: Float[Tensor, "rays 3"]
     """The light of its rays without the background's."""
     rgb: Float[Tensor, "rays 3"]

@@ -38,7 +38,7 @@ def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatche
     # Larger ones than the first that takes all points at once would be the same.
     best = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, step, batch, num_rays, tile))
     step.reset_statistics()
-    log.info("tiles of %d points are the fastest of those tried here", best)
+    log.info("tiles of %d points are the fastest of those measured", best)
     return best
 
 

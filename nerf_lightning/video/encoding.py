@@ -88,7 +88,7 @@ def write_animation(
 ) -> None:
     """Write frames as an animated WebP, which pages and messages play by themselves, in a loop without end.
 
-    The arguments are those of `write_video`; each frame is shown for a whole number of milliseconds, equal neighbours
+    The arguments are those of `write_video`; each frame is shown for a whole number of milliseconds, equal neighbors
     as one.
     """
     first, frames = _counted(path, frames, total)

@@ -1,4 +1,4 @@
-"""Frames for compositing as EXR, by OpenEXR: colours in linear light, and depth, as floats."""
+"""Frames for compositing as EXR, by OpenEXR: colors in linear light, and depth, as floats."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ def exr_channels(
 ) -> dict[str, Float[Tensor, "height width"]]:
     """Return what a frame holds, by the names that compositors know: Z of `depth`, R, G, B of `colors`, A of `alpha`.
 
-    With alpha, colours are multiplied with it, as EXR has them; then the picture has been rendered over black.
+    With alpha, colors are multiplied with it, as EXR has them; then the picture has been rendered over black.
     """
     channels: dict[str, Tensor] = {}
     if colors:

@@ -1,4 +1,4 @@
-"""Film models along a camera path: colour, depth and more, as videos or as frames, where there is memory for one."""
+"""Film models along a camera path: color, depth and more, as videos or as frames, where there is memory for one."""
 
 import hashlib
 import json
@@ -35,9 +35,9 @@ def film(
 ) -> list[Path]:
     """Write the films (`video.mp4`, `depth.mp4`; or folders of frames of these names) and return where they are.
 
-    A film that was stopped goes on with its missing frames. Depth is along the ray, in metres where the capture's unit
-    is known and else in its own, coloured over the range of what is seen on the whole path, with its scale beside it.
-    Several models of one capture are shown side by side. Without settings, colour and depth are filmed, as videos.
+    A film that was stopped goes on with its missing frames. Depth is along the ray, in meters where the capture's unit
+    is known and else in its own, colored over the range of what is seen on the whole path, with its scale beside it.
+    Several models of one capture are shown side by side. Without settings, color and depth are filmed, as videos.
 
     Raises:
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
@@ -59,7 +59,7 @@ def film(
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         if "depth" in settings.outputs and ranks.is_first():
-            log.info("depth is in %s, and most of it lies from %.3g to %.3g", told_length(first)[1], *seen)
+            log.info("depth is in %s, mostly from %.3g to %.3g", told_length(first)[1], *seen)
         for number in tracked(ranks.every_other(missing), "filming"):
             if settings.form == "exr":
                 view = shots[0].picture(number)

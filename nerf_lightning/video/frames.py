@@ -1,7 +1,7 @@
 """The frames of a film on the disk: each is written as soon as it is rendered, so a stopped film goes on.
 
 `.frames/film.json` in the output folder says which film the frames belong to (a fingerprint of all that decides what is
-seen) and over which depths their colours reach.
+seen) and over which depths their colors reach.
 """
 
 import logging
@@ -53,7 +53,7 @@ class FilmFrames:
         self.suffix = ".exr" if form == "exr" else ".png"
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
-        """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
+        """Take hold of the folder; return the frames that are missing, and the range of the depth's colors.
 
         Frames of another film are removed, and the range is measured anew. A folder that another process films into, or
         whose files are not ours, is refused.
@@ -75,7 +75,7 @@ class FilmFrames:
         missing = [number for number in range(self.count) if not self._is_there(number)]
         if len(missing) < self.count:
             there = self.count - len(missing)
-            log.info("%d of %d frames are there already: the missing ones follow", there, self.count)
+            log.info("%d of %d frames exist already: rendering the missing ones", there, self.count)
         near, far = note["depth_range"]
         return missing, (near, far)
 

@@ -35,8 +35,8 @@ def panel(
     """Return one output of a view (a key of `FILMS`, or a channel) as a picture.
 
     `levels` is the absolute difference of the first level that makes pictures and the last; `normals` are the
-    surface's, as colours: 0.5 + 0.5 n along the axes of the capture's own frame. `depth_range` is near and far of the
-    depth's colours, in metres or the user's units, of which `unit` make one of the scene's.
+    surface's, as colors: 0.5 + 0.5 n along the axes of the capture's own frame. `depth_range` is near and far of the
+    depth's colors, in meters or the user's units, of which `unit` make one of the scene's.
     """
     if output == "depth":
         return depth_picture(unit * picture.depth, *depth_range, picture.opacity)
@@ -50,7 +50,7 @@ def panel(
 
 
 def channel_picture(name: str, picture: Picture) -> UInt8[Tensor, "height width 3"]:
-    """Return a channel as a picture: one number a pixel in grey, three as colours, more in the colour of the largest.
+    """Return a channel as a picture: one number a pixel in gray, three as colors, more in the color of the largest.
 
     Numbers are shown as they are, from 0 to 1.
     """

@@ -28,13 +28,13 @@ class FilmSettings:
     """One film of all outputs, in place of one for each."""
     form: Form = "video"
     alpha: bool = False
-    """The film of the colours has them straight, with the opacity as alpha; nothing lies behind the scene."""
+    """The film of the colors has them straight, with the opacity as alpha; nothing lies behind the scene."""
     near: float | None = None
     """Where rays begin; None: where the photographs' do."""
     crop: tuple[Corner, Corner] | None = None
     """Lower and upper corner of a box, outside of which nothing is shown."""
     hold_camera: bool = False
-    """Stay at the first camera, and let only the direction from which colour is looked up move."""
+    """Stay at the first camera, and let only the direction from which color is looked up move."""
     projection: Projection = "perspective"
     """Equirectangular: each frame is a panorama of all directions, whose middle is where the camera looks."""
     precision: str | None = None
@@ -78,7 +78,7 @@ def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
     elif config["mosaic"]:
         reason = "mosaic=true sets pictures on white paper. Leave one of the two out"
     elif "rgb" not in outputs:
-        reason = "the colours get it, and outputs has no rgb"
+        reason = "the colors get it, and outputs has no rgb"
     else:
         return
     raise InputError(f"alpha=true: {reason}.")

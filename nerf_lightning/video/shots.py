@@ -2,13 +2,20 @@
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import (
+    at_most,
+    camera_coordinates,
+    coarse_pixels,
+    rays_through_pixels,
+    seen_at,
+)
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, told_length, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
@@ -20,18 +27,21 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
-from nerf_lightning.video.paths.base import CameraPath, frame_of
+from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame, frame_of
+from nerf_lightning.video.paths.sweep import MIDDLE
 from nerf_lightning.video.settings import FilmSettings
 
-# The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
-PROBES, PROBE_PIXELS = 8, 64
+# The range of the depth's colors is taken from so many frames, with at most so many pixels along their longer side.
+PROBES, PROBE_PIXELS = 12, 64
+MOST_POINTS = 1000  # Of the content
+IN_MOST = 0.5  # Of the views: what these show in their middle is what the capture is about.
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model to be filmed, and where it was learnt."""
+    """A model to be filmed, and where it was learned."""
 
     model: Model
     scene: SceneRecord
@@ -46,7 +56,7 @@ class Shot:
     subject: Subject
     cameras: Cameras
     seen_from: Cameras | None
-    """Cameras whose directions the colour is looked up from, where the camera itself is held."""
+    """Cameras whose directions the color is looked up from, where the camera itself is held."""
     near: Float[Tensor, "frames"]
     far: Float[Tensor, "frames"]
     clip: Clip | None
@@ -54,7 +64,7 @@ class Shot:
 
     @property
     def unit(self) -> float:
-        """How many metres, or where nobody knows units of the user's, make a unit of the scene's."""
+        """How many meters, or where nobody knows units of the user's, make a unit of the scene's."""
         return told_length(self.subject.scene)[0]
 
     @property
@@ -70,20 +80,20 @@ class Shot:
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the unit normals of what the picture shows, in the user's axes."""
-        normals = normals_from_depth(self._surface(frame, picture))
+        normals = normals_from_depth(self.surface(frame, picture))
         to_user = self.subject.scene.to_user
         return normals @ (to_user[:3, :3] / unit_of(to_user)).mT.to(normals)
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
-        """Return how far what the picture shows lies from the camera, in metres or the user's units (`unit`).
+        """Return how far what the picture shows lies from the camera, in meters or the user's units (`unit`).
 
         Along the camera's axis; of a panorama, which has none, along the ray.
         """
-        local = camera_coordinates(self.cameras, frame, self._surface(frame, picture))
+        local = camera_coordinates(self.cameras, frame, self.surface(frame, picture))
         panorama = self.cameras.lens_model == "equirectangular"
         return self.unit * (local.norm(dim=-1) if panorama else -local[..., 2])
 
-    def _surface(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
+    def surface(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the points of the scene that the picture shows."""
         return picture_surface(self.rays, frame, picture, self.clip)[1]
 
@@ -103,7 +113,7 @@ def make_shots(
     """Return the shot of each model of a capture, on a path in the first one's frame; working frames may differ."""
     settings = settings or FilmSettings()
     first, near, crop = subjects[0].scene, settings.near, settings.crop
-    cameras = lay_path(path, first)
+    cameras = lay_path(path, first, partial(content_of, subjects[0], tile_points))
     if settings.projection == "equirectangular":
         cameras = _panoramas(cameras, path, first)
     shots = []
@@ -128,9 +138,36 @@ def shot_of(subject: Subject, cameras: Cameras, tile_points: int) -> Shot:
     return Shot(subject, _bent(cameras, subject.scene), None, near, far, clip=None, tile_points=tile_points)
 
 
-def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:
+def lay_path(path: CameraPath, scene: SceneRecord, content: Content = PathFrame.content) -> Cameras:
     """Return the cameras of a path around a scene, or say why it cannot be laid there."""
-    return path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
+    return path.cameras(frame_around(scene, content))
+
+
+def frame_around(scene: SceneRecord, content: Content = PathFrame.content) -> PathFrame:
+    """Return the frame in which paths around a scene are laid."""
+    frame = frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names)
+    return replace(frame, bounded=scene.space == "bounded", content=content)
+
+
+@torch.no_grad()
+def content_of(subject: Subject, tile_points: int) -> Float[Tensor, "points 3"]:
+    """Return points that a few small training views show, those in the middle of most of these views."""
+    shot = shot_of(subject, subject.scene.cameras[list(subject.scene.splits["train"])], tile_points).small()
+    views, points = range(len(shot.cameras.c2w)), []
+    for view in views:
+        picture = shot.picture(view)
+        surface = shot.surface(view, picture)
+        points.append(surface[(picture.opacity > 0.5) & surface.isfinite().all(dim=-1)])
+    every = torch.cat(points)
+    share = torch.stack([_in_middle(shot.cameras, view, every) for view in views]).float().mean(dim=0)
+    content = every[share >= IN_MOST]
+    return content[:: 1 + len(content) // MOST_POINTS]
+
+
+def _in_middle(cameras: Cameras, view: int, points: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
+    inside, x, y = seen_at(cameras, view, points)
+    across, down = ((2 * at + 1) / size[view] - 1 for at, size in ((x, cameras.width), (y, cameras.height)))
+    return inside & (torch.maximum(across.abs(), down.abs()) <= MIDDLE)
 
 
 def depth_range(shots: list[Shot]) -> tuple[float, float]:
@@ -152,7 +189,7 @@ def depth_range(shots: list[Shot]) -> tuple[float, float]:
 
 
 def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
+    """Tell which cameras normalized device coordinates can render: before the plane z = -1, and looking along -z."""
     zeros = torch.zeros(len(cameras.c2w))
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
@@ -162,7 +199,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
     """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
     if scene.cameras.ndc is not None:
         raise InputError(
-            f"projection=equirectangular looks to all sides, and {scene.name} was learnt in normalised device "
+            f"projection=equirectangular looks to all sides, and {scene.name} was learned in normalized device "
             "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted."
         )
     if path.fov is not None:
@@ -184,7 +221,7 @@ def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Ca
 
 
 def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
-    """Return the cameras with rays through normalised device coordinates, where the scene was learnt in these."""
+    """Return the cameras with rays through normalized device coordinates, where the scene was learned in these."""
     if scene.cameras.ndc is None:
         return cameras
     count = len(cameras.c2w)

@@ -10,7 +10,7 @@ from nerf_lightning.messages.errors import InputError
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 # A machine's name or address, and perhaps a port.
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::[0-9]{1,5})?")
-NO_TOKEN = "This page is for whoever has its token: open the address with ?token= that nerf printed when it started."
+NO_TOKEN = "The access token is missing: open the whole address that nerf printed, with ?token=..."
 FOREIGN = "This request comes from another site, which may not speak to this page."
 
 

@@ -20,7 +20,7 @@ class CameraState:
     """One wish of a person; a new wish is a new object."""
 
     c2w: Float[Tensor, "3 4"]
-    """Camera to world, columns right, up, back, centre; the model's frame."""
+    """Camera to world, columns right, up, back, center; the model's frame."""
     fov: float
     """Vertical field of view in radians."""
     width: int

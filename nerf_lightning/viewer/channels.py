@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
-COLOR = "colour"
+COLOR = "color"
 PAPER, LINE = 237, 255
 # Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
@@ -26,7 +26,7 @@ def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
     """Return a channel of a view as a picture.
 
     Depth is bright where it is near, over the range of what this view shows; normals are in the model's axes, each from
-    -1 to 1 as red, green and blue. What light passes through fades to pale grey.
+    -1 to 1 as red, green and blue. What light passes through fades to pale gray.
     """
     return to_bytes(CHANNELS[channel](view))
 

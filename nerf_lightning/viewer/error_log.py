@@ -32,7 +32,7 @@ class ErrorLog:
             try:
                 act(*arguments)
             except Exception as error:
-                self.say("the viewer did not do what somebody clicked", error)
+                self.say("a request of the viewer's page failed", error)
 
         return careful
 

@@ -37,9 +37,9 @@ class Page:
         queue: renders; whoever owns the page calls its `work`.
         photographs: of the capture, for frusta and comparison.
         folder: where snapshots and camera paths are written.
-        host: the address to listen on; 127.0.0.1 is heard by this machine alone.
+        host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
         port: the port, or the first to try.
-        most_height: the finest picture, in pixels.
+        most_height: height of the finest image, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
         training: what the page may ask of the training that it shows; None: it shows none.
     """

@@ -65,7 +65,7 @@ class RenderQueue:
                     return True
             except Exception as error:
                 refinement.give_up()
-                self.errors.say("a picture of the viewer could not be drawn", error)
+                self.errors.say("an image of the viewer could not be rendered", error)
                 return True
         return False
 

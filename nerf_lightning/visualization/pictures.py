@@ -1,6 +1,6 @@
-"""Pictures: floats to bytes, scalars to colours, panels side by side.
+"""Pictures: floats to bytes, scalars to colors, panels side by side.
 
-A picture is uint8 (height, width, 3) on the CPU, row 0 on top; colours before that are floats in [0, 1].
+A picture is uint8 (height, width, 3) on the CPU, row 0 on top; colors before that are floats in [0, 1].
 """
 
 import math
@@ -19,7 +19,7 @@ from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.row_chunks import row_chunks
 
 ENOUGH_PIXELS = 1 << 18  # For the range of what is visible.
-ERROR_SCALE = 0.25  # Absolute error that gets the brightest colour: always the same, so that two runs can be compared.
+ERROR_SCALE = 0.25  # Absolute error that gets the brightest color: always the same, so that two runs can be compared.
 
 LONGEST_PANEL = 1600
 """Pixels along the longer side of a panel of the validation picture, about, at most: a row of four photographs would
@@ -27,11 +27,11 @@ be more than anything shows."""
 
 PAPER = 255
 _INK = (64, 64, 64)
-_BACKDROP = 0.93  # Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far.
+_BACKDROP = 0.93  # Gray of what no ray hits: no color of the map is gray, so it reads as neither near nor far.
 
 
 def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
-    """Return colours in [0, 1] as bytes on the CPU: clamped, then rounded to the nearest; NaN becomes black.
+    """Return colors in [0, 1] as bytes on the CPU: clamped, then rounded to the nearest; NaN becomes black.
 
     >>> to_bytes(torch.tensor([[-1.0, 0.5, 2.0]])).tolist()
     [[0, 128, 255]]
@@ -45,7 +45,7 @@ def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
 def straight_colors(
     rgb: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
 ) -> UInt8[Tensor, "height width 4"]:
-    """Return what was rendered over black as straight colours and alpha; where nothing is seen, all four are 0.
+    """Return what was rendered over black as straight colors and alpha; where nothing is seen, all four are 0.
 
     >>> straight_colors(torch.tensor([[[0.25, 0.0, 0.5]]]), torch.tensor([[0.5]])).tolist()
     [[[128, 0, 255, 128]]]
@@ -56,16 +56,16 @@ def straight_colors(
 
 
 def save_png(path: Path, picture: UInt8[Tensor, "height width *channels"]) -> None:
-    """Write a picture, grey, RGB, or RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
+    """Write a picture, gray, RGB, or RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
     with whole_file(path) as part:
         Image.fromarray(picture.numpy()).save(part, format="PNG")
 
 
 def color_map(values: Float[Tensor, "height width"], low: float, high: float) -> Float[Tensor, "height width 3"]:
-    """Return colours, dark at `low` and bright at `high`, perceptually uniform between (matplotlib's magma).
+    """Return colors, dark at `low` and bright at `high`, perceptually uniform between (matplotlib's magma).
 
     `low` may exceed `high`: `color_map(depth, far, near)` shows what is near as bright. Values outside the
-    range take its end colours; NaN takes the colour of `low`.
+    range take its end colors; NaN takes the color of `low`.
     """
     span = high - low if high != low else 1.0
     place = torch.nan_to_num((values.detach().float().cpu() - low) / span, nan=0.0).clamp(0, 1)
@@ -105,9 +105,9 @@ def depth_picture(
     far: float,
     opacity: Float[Tensor, "height width"] | None = None,
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return depth in colours, near bright, with its scale on the right.
+    """Return depth in colors, near bright, with its scale on the right.
 
-    Where `opacity` is given, what light passes through fades to pale grey.
+    Where `opacity` is given, what light passes through fades to pale gray.
     """
     picture = torch.empty(*depth.shape, 3, dtype=torch.uint8)
     for rows in row_chunks(*depth.shape):
@@ -119,7 +119,7 @@ def depth_picture(
 def faded(
     colors: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width 3"]:
-    """Return colours that fade to pale grey where light passes through."""
+    """Return colors that fade to pale gray where light passes through."""
     shown = opacity.detach().float().cpu().clamp(0, 1)[..., None]
     return colors * shown + _BACKDROP * (1 - shown)
 
@@ -127,7 +127,7 @@ def faded(
 def error_picture(
     truth: Float[Tensor, "height width 3"], render: Float[Tensor, "height width 3"]
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return the absolute error (mean of the channels) in colours, 0 to `ERROR_SCALE`, with its scale."""
+    """Return the absolute error (mean of the channels) in colors, 0 to `ERROR_SCALE`, with its scale."""
     picture = torch.empty(truth.shape, dtype=torch.uint8)
     for rows in row_chunks(*truth.shape[:2]):
         error = (truth[rows].detach().float().cpu() - render[rows].detach().float().cpu()).abs().mean(dim=-1)
@@ -195,7 +195,7 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
 
 
 def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
-    """Set a slim colour bar at the picture's right, from bright at `top` down to dark, with both numbers."""
+    """Set a slim color bar at the picture's right, from bright at `top` down to dark, with both numbers."""
     height = picture.shape[0]
     size = letter_size(height)
     font = ImageFont.load_default(size)

@@ -79,7 +79,7 @@ def test_a_gpu_that_is_not_there(nerf):
         ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
         ("init_from=[1]", "init_from=[1] does not fit: it must be a path"),
         ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 does not fit: it must be a Field, chosen by"),
-        ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Mend optimizer.*"),
+        ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Fix optimizer.*"),
         ("callbacks.monitor=5", "callbacks.monitor=5 is no callback. To do without one, add ~callbacks.monitor."),
         ("budget=null", "budget=None does not fit: it holds settings, such as budget.seconds=VALUE"),
         ("final=5", "final=5 does not fit: it holds settings, such as final.evaluate=VALUE"),

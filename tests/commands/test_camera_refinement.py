@@ -45,7 +45,7 @@ def test_a_run_says_how_far_its_cameras_moved_and_every_command_uses_them(nerf, 
     assert again["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
     result = nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path / 'export'}")
     assert result.code == 0, result.err
-    assert "the cameras are those that training refined" in result.out
+    assert "the cameras are the refined ones" in result.out
     record, given = read_checkpoint(checkpoint).scene, read_checkpoint(checkpoint).given_cameras
     frames = json.loads((tmp_path / "export" / "transforms.json").read_text())["frames"]
     written = torch.tensor([frame["transform_matrix"] for frame in frames], dtype=torch.float64)[:, :3]
@@ -60,6 +60,6 @@ def test_a_scene_whose_rays_are_bent_is_refused_with_the_reason(nerf, tmp_path):
                   f"paths.output_dir={tmp_path / 'run'}")  # fmt: skip
     assert result.code == 2
     assert "Traceback" not in result.err
-    for part in ("normalised device coordinates", "scene.space=contracted", "refinement=none"):
+    for part in ("normalized device coordinates", "scene.space=contracted", "refinement=none"):
         assert part in result.err.splitlines()[-1]
     assert not (tmp_path / "run").exists()

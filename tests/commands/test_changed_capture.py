@@ -1,4 +1,4 @@
-"""A run goes on with the capture that it has learnt from, wherever it is started: another one is refused."""
+"""A run goes on with the capture that it has learned from, wherever it is started: another one is refused."""
 
 import json
 import shutil
@@ -50,7 +50,7 @@ def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(key, ner
         result = nerf(*begun, "resume_changed_capture=true")
         assert result.code == 0, result.err
         assert WHAT[key] in result.out + result.err
-        assert "going on from step 6" in result.out + result.err
+        assert "resuming from step 6" in result.out + result.err
 
 
 WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}

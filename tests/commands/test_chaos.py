@@ -192,7 +192,7 @@ def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, 
     process.send_signal(signal.SIGTERM)
     code, output = ended(process)
     assert code == 128 + signal.SIGTERM, output
-    assert f"going on from step {step}" in output
+    assert f"resuming from step {step}" in output
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="needs a place where nobody can write")

@@ -46,4 +46,4 @@ def test_it_trains_films_and_goes_on(tmp_path, capture):
     assert (run / "video.mp4").stat().st_size > 0
     second = nerf(f"resume={run}", "trainer.max_steps=6", "final.video=false")
     assert second.returncode == 0, second.stderr[-3000:]
-    assert "going on from step 4" in second.stderr
+    assert "resuming from step 4" in second.stderr

@@ -71,7 +71,7 @@ def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
     if result.code:
         said(result, "There is nothing to export")
         return
-    assert "without their photographs" in result.err
+    assert "so this goes without them: The file" in result.err
     assert "against the photographs" not in result.out
     assert 'class="without"' in (tmp_path / "page.html").read_text()
 

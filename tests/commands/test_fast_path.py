@@ -49,7 +49,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
         assert code in (-how, 128 + how), output
     code, output = finished(start(*arguments(capture, folder, *shared)))
     assert code == 0, output
-    assert "going on from step" in output
+    assert "resuming from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")
     for part in ("global_step", "state_dict", "optimizer_states"):
         mine, other = dict(flat(ours[part])), dict(flat(theirs[part]))

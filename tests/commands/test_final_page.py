@@ -1,8 +1,8 @@
-"""`nerf train final.page=true`: the page at the end of a run, and in its report; without it, the run stays."""
+"""`nerf train final.page=true`: exports at the end of a run, and in its report; without them, the run stays."""
 
 import json
 import os
-import shutil
+import re
 
 import pytest
 from support.baked_ball import all_around, record_of
@@ -41,11 +41,17 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
         (folder / "page.html").write_bytes(MARK)
         return [folder / "page.html"]
 
-    result = train(export, "final.page=small", "final.report=true")
+    result = train(export, "final.page.quality=small", "final.cameras=true", "final.report=true")
     assert result.code == 0, result.err
-    run = tmp_path / "run"
-    assert f"page         {run}/page.html" in result.out
-    assert 'href="./page.html"' in (run / "report.html").read_text()
+    exported = tmp_path / "run" / "export"
+    assert f"page         {exported}/page.html" in result.out
+    assert f"cameras      {exported}/transforms.json" in result.out
+    report = (exported.parent / "report.html").read_text()
+    assert 'href="./export/page.html">Walk around' in report
+    assert 'href="./export/transforms.json">transforms.json (0.' in report
+    last = result.out.splitlines()[-1]
+    found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it: .+\."
+    assert re.fullmatch(found, last), last
     assert (seen["quality"], seen["training"]) == ("small", False)
     assert len(seen["beside"].photographs.view_names) == 10
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)
@@ -58,31 +64,38 @@ def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
     result = train(export, "final.page=true")
     assert result.code == 0, result.err
     run = tmp_path / "run"
-    assert "The run is whole, but its page (final.page) could not be made: OSError: [Errno 28] No space" in result.err
-    assert f"nerf export ckpt={run} what=page makes it" in result.err
+    assert "The run is whole, but final.page failed: OSError: [Errno 28] No space" in result.err
+    assert f"nerf export ckpt={run} what=page writes it" in result.err
+    assert not (run / "export").exists()
     assert "Traceback" not in result.err
     assert json.loads((run / "run.json").read_text())["finished_at_step"] == 4
 
 
-def test_what_cannot_become_a_page_is_said_before_the_training(train, tmp_path):
-    said(train(PageExport.export, "final.page=huge"), "final.page=huge", "small, medium, large")
+@pytest.mark.parametrize(
+    ("argument", "parts"),
+    [
+        ("final.page=huge", ("final.page=huge: give true, or settings", "final.page.KEY=VALUE")),
+        ("final.page.quality=huge", ("final.page: what.quality=huge", "small, medium, large")),
+        ("final.page.size=3", ("final.page: nerf export has no setting what.size",)),
+        ("final.pages=true", ("nerf train has no setting final.pages",)),
+    ],
+)
+def test_what_cannot_be_exported_is_said_before_the_training(train, tmp_path, argument, parts):
+    said(train(PageExport.export, argument), *parts)
     assert not (tmp_path / "run").exists()
 
 
-def test_the_report_links_the_newest_page_from_wherever_it_lies(nerf, tmp_path):
+def test_the_report_links_the_page_from_wherever_it_lies(nerf, tmp_path):
     run = leave_measured_run(tmp_path / 'a "run" <b>')
     target = tmp_path / "elsewhere" / "report.html"
     given = (run, "doctor=false", f"paths.output_dir={target.parent}")
-    (run / "page.html").write_text("<html>somebody's own</html>")
-    assert nerf("report", *given).code == 0
-    assert 'id="scene"' not in target.read_text()
     (run / "export").mkdir()
+    (run / "export" / "page.html").write_text("<html>somebody's own</html>")
+    assert nerf("report", *given).code == 0
+    assert "page.html" not in target.read_text()
     (run / "export" / "page.html").write_bytes(MARK)
     assert nerf("report", *given).code == 0
     assert 'href="./../a%20%22run%22%20%3Cb%3E/export/page.html"' in target.read_text()
-    shutil.copy(run / "export" / "page.html", run / "page.html")
-    assert nerf("report", *given).code == 0
-    assert "%3Cb%3E/page.html" in target.read_text()
 
 
 def record(folder, name, age, x):

@@ -32,9 +32,9 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     result = nerf("help", "data.sample_budget")
     assert result.code == 0
     assert result.out.startswith("data.sample_budget=131072\n")
-    assert "so that a step has about so many samples; null: they do not." in " ".join(result.out.split())
+    assert "The target number of samples per step" in " ".join(result.out.split())
     assert "Takes int | null." in result.out
-    assert "model=fast_large 524288" in " ".join(result.out.split())
+    assert "model=fast_large 262144" in " ".join(result.out.split())
     result = nerf("train", "--help", "scene=colmap")
     assert result.out == nerf("help", "scene=colmap").out == nerf("help", "train", "scene=colmap").out
     assert "A COLMAP reconstruction" in result.out
@@ -45,16 +45,16 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert nerf("help", "export").out == nerf("export", "--help").out
     assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
-    assert "in the user's units; null: from the capture." in told
+    assert "in the capture's units; null: from the capture." in told
     assert "With scene=blender" in told
 
 
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        ("fog", "\n  * The training was short: fog"),
-        ("blurry", "Blurred, though it trained long enough"),
-        ("grey", "The picture is grey"),
+        ("fog", "\n  * Fog disappears last"),
+        ("blurry", "Blurred, although it trained long enough"),
+        ("gray", "The picture is gray"),
         ("gpu", "\n  trainer=gpu  "),
         ("learning rate", "  optimizer.lr  "),
         ("batch size", "  data.batch_rays  "),
@@ -67,8 +67,8 @@ def test_words_that_name_nothing_are_looked_for_in_meanings_and_symptoms(nerf, w
 
 def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
     told = nerf("help", "ckpt").out
-    assert "nerf eval: ckpt=(required)\n    The run folder or checkpoint to measure." in told
-    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to look at." in told
+    assert "nerf eval: ckpt=(required)\n    The run folder or checkpoint to evaluate." in told
+    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to show." in told
 
 
 @pytest.mark.parametrize(

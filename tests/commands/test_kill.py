@@ -64,7 +64,7 @@ def assert_the_same_end(plans, capture, folder, never_killed):
     left = {path.name for path in (folder / "checkpoints").iterdir()}
     assert left == {"last.ckpt", "previous.ckpt", "best.ckpt"}, story
     killed = sum(code != 0 for code in codes)
-    print(f"{killed} kills of {len(plans)} starts; went on {said.count('going on from step')} times")
+    print(f"{killed} kills of {len(plans)} starts; went on {said.count('resuming from step')} times")
     return killed
 
 

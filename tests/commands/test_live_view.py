@@ -1,4 +1,4 @@
-"""The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
+"""The page while training: it shows what is learned, changes nothing of it, and closes with the run."""
 
 import math
 import re
@@ -165,7 +165,7 @@ def test_what_cannot_be_drawn_ends_no_training(trainer, caplog):
         refinement.ask(CameraState(torch.eye(4)[:3], 0.0, 16, 16))
         callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
     assert renderer.slices.call_count > 1
-    assert caplog.text.count("could not be drawn: ZeroDivisionError") == 1
+    assert caplog.text.count("could not be rendered: ZeroDivisionError") == 1
 
 
 class Watched:

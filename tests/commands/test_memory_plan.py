@@ -226,7 +226,7 @@ def test_a_plan_is_logged_row_by_row_for_who_asks(monkeypatch, caplog):
 def test_a_plan_is_one_line_that_says_what_is_counted_and_not_mentioned_where_it_is_small(monkeypatch, caplog):
     _, messages = announced(monkeypatch, caplog, logging.INFO, free=10**10)
     assert len(messages) == 1
-    assert messages[0].startswith("memory: at most about 3.0 GB beside the ")
+    assert messages[0].startswith("memory: at most about 3.0 GB on top of the ")
     assert "10.0 GB are free" in messages[0]
     caplog.clear()
     assert announced(monkeypatch, caplog, logging.INFO, free=10**12)[1] == []

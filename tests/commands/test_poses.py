@@ -112,12 +112,15 @@ def test_heic_is_named_or_passed_over_and_panoramas_among_other_photographs_are_
     assert "No camera could be placed: the 3 pictures" in result.err
 
 
-@pytest.mark.parametrize(("blur", "said"), [(6, "are blurred, although they are the sharpest"), (0, "share too few")])
-def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, blur, said):
+@pytest.mark.parametrize(
+    ("pictures", "blur", "said"),
+    [(4, 6, "are nearly all blurred, although"), (4, 0, "share too few"), (1, 0, "without depth, all from one place")],
+)
+def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, pictures, blur, said):
     imageio = pytest.importorskip("imageio.v3")
     frames = []
-    for number in range(4):  # nothing is seen twice
-        pixels = np.random.default_rng(number).integers(0, 255, (96, 96, 3), dtype=np.uint8)
+    for number in range(4):  # nothing is seen twice, or the camera stands still
+        pixels = np.random.default_rng(number % pictures).integers(0, 255, (96, 96, 3), dtype=np.uint8)
         frame = Image.fromarray(pixels).resize((192, 192), Image.Resampling.NEAREST)
         frames.append(np.asarray(frame.filter(ImageFilter.GaussianBlur(blur))))
     imageio.imwrite(tmp_path / "film.mp4", np.stack(frames), plugin="FFMPEG", fps=10, quality=9)

@@ -144,7 +144,7 @@ def in_frame(first, to_user):
 
 
 def egg_in(to_user):
-    """A model of what is there in the user's frame, wherever it was learnt: no two of its axes look alike."""
+    """A model of what is there in the user's frame, wherever it was learned: no two of its axes look alike."""
 
     def distance(positions):
         stretched = points_to_user(positions, to_user.float()) / torch.tensor([0.9, 0.6, 0.4])

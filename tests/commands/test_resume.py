@@ -57,10 +57,10 @@ def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped):
     process.send_signal(signal.SIGTERM)
     code, output = finished(process)
     assert code == 143, output
-    assert f"go on with: nerf train resume={folder}" in output
+    assert f"resume with: nerf train resume={folder}" in output
     code, output = finished(start("train", f"resume={folder}"))
     assert code == 0, output
-    assert "going on from step" in output
+    assert "resuming from step" in output
     assert_same_to_the_bit(state(folder), never_stopped)
     log = EventAccumulator(str(folder / "tensorboard")).Reload()
     assert [event.step for event in log.Scalars("Training loss/sum")] == list(range(5, STEPS + 1, 5))
@@ -93,7 +93,7 @@ def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path,
     assert_same_to_the_bit(state(folder), never_stopped)
 
 
-# What srun sets for a job of one task; by SLURM_NTASKS Lightning recognises Slurm.
+# What srun sets for a job of one task; by SLURM_NTASKS Lightning recognizes Slurm.
 SLURM = {"JOB_ID": "4711", "JOB_NAME": "nerf", "NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0"}
 SLURM |= {"NODELIST": "localhost"}
 
@@ -194,7 +194,7 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
     assert (note["slurm_job"], note["preempted"]) == ("4711", True)
     code, output = finished(begin(capture, root, env={"SLURM_RESTART_COUNT": "1"}))
     assert code == 0, output
-    assert "going on from step" in output
+    assert "resuming from step" in output
     assert len(list(root.rglob("run.json"))) == 1
     assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 150
 
@@ -212,6 +212,6 @@ def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path)
     code, output = finished(process)
     assert code == 0, output
     (log,) = folder.glob(".submitit/*/*_log.err")
-    assert "going on from step" in log.read_text()
+    assert "resuming from step" in log.read_text()
     assert json.loads((run / "run.json").read_text())["finished_at_step"] == 150
     assert json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())["state"] == "finished"

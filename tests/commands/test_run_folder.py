@@ -66,7 +66,7 @@ def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path
     before = json.loads((tmp_path / "here/run.json").read_text())
     with pytest.raises(InputError, match=r"occupied by a run of another config \(seed: there 0, here 3\)"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here", "seed=3", "resume=auto"), 100, None)
-    with pytest.raises(InputError, match=r"already holds a run of this very config. Add resume=auto"):
+    with pytest.raises(InputError, match=r"already contains a run with these settings. Add resume=auto"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here"), 100, None)
     assert json.loads((tmp_path / "here/run.json").read_text()) == before
 

@@ -139,13 +139,13 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     code, output = finished(process)
     assert code == -signal.SIGKILL
     told = next(line for line in output.splitlines() if "after a stop, go on with" in line)
-    command = told.partition("go on with: nerf ")[2].split()
+    command = told.partition("resume with: nerf ")[2].split()
     assert command == ["train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"]
     before = json.loads((tmp_path / "0_seed=0" / "run.json").read_text())
     code, output = run(*command)
     assert code == 0, output
     assert "job 0 has finished before" in output
-    assert "going on from step" in output
+    assert "resuming from step" in output
     assert json.loads((tmp_path / "0_seed=0" / "run.json").read_text()) == before
     assert {row["state"] for row in table(tmp_path)} == {"finished before", "finished"}
     assert {row["steps"] for row in table(tmp_path)} == {"80"}

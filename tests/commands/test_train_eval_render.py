@@ -138,8 +138,8 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_pa
     little = ("trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7", "final.video=false")
     result = train(*little, f"init_from={finished_run}", "resume=auto")
     assert result.code == 0, result.err
-    assert f"begins with the weights of {finished_run}/checkpoints/last.ckpt, of step " in result.err
-    assert "resume=auto: there is no unfinished run of this config to go on with" in result.err
+    assert f"starting from the weights of {finished_run}/checkpoints/last.ckpt, step " in result.err
+    assert "resume=auto: there is no unfinished run with these settings to resume" in result.err
     ours = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     theirs = torch.load(finished_run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)

@@ -96,7 +96,7 @@ def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_
     model = TrainerSettings(accelerator="cpu", precision=precision).prepare(tiny_model())
     layers = [module for module in model.modules() if isinstance(module, Linear)]
     assert {layer.matmul_precision for layer in layers} == {matmul_precision}
-    assert len(layers) == 2 * 5  # three of the trunk, the feature, the colour's hidden one
+    assert len(layers) == 2 * 5  # three of the trunk, the feature, the color's hidden one
     assert {parameter.dtype for parameter in model.parameters()} == {torch.float32}
 
 

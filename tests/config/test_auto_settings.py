@@ -10,7 +10,8 @@ from support.running import FAST
 from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job.build import assemble_job
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
+from nerf_lightning.compute import devices
+from nerf_lightning.config.auto_settings import GPU_BATCHES, resolve_auto, resolve_correction
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
@@ -37,8 +38,37 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     config, choices = chosen_for(scene, "seed=3")
     assert choices["model"] == model
     assert (config.data.batch_rays, config.seed) == (batch_rays, 3)
-    assert f"model: {model}, since " in caplog.text
-    assert "(model=NAME chooses another)" in caplog.text
+    assert f"model: {model}, because " in caplog.text
+    assert "(choose another with model=NAME)" in caplog.text
+
+
+@pytest.mark.parametrize(("scene", "model"), [(IN_A_BOX, "fast"), (PHOTOGRAPHS, "fast_proposal")])
+def test_a_gpu_takes_larger_batches_and_says_so(caplog, scene, model):
+    caplog.set_level("INFO")
+    config, choices = compose_config("train", [])
+    plain = resolve_auto(config, choices, [], scene)[0]
+    assert "samples a step" not in caplog.text
+    larger = resolve_auto(config, choices, [], scene, on_gpu=True)[0]
+    assert larger.data.batch_rays == GPU_BATCHES[model]["data.batch_rays"] == 2 * plain.data.batch_rays
+    assert caplog.text.count("about 2^18 samples a step") == 1
+    # A run goes on with the batches that it began with, wherever that was.
+    for on_gpu, former in ((True, plain), (False, larger)):
+        again = resolve_auto(config, choices, [], scene, on_gpu, OmegaConf.to_container(former, resolve=True))[0]
+        assert again.data == former.data
+    typed = ["data.batch_rays=77", "data.sample_budget=5000"]
+    config, choices = compose_config("train", typed)
+    assert resolve_auto(config, choices, typed, scene, on_gpu=True)[0].data.batch_rays == 77
+
+
+def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a stand-in")
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    monkeypatch.setattr(devices, "_trouble_of_gpu", lambda: None)
+    overrides = ["scene=bricks", "scene.resolution=16", "encoder.log2_table_size=8"]
+    job = assemble_job(*compose_config("train", overrides), overrides)
+    assert job.settings.device_type == "cuda"
+    assert job.data.batches.batch_rays == GPU_BATCHES["fast"]["data.batch_rays"]
 
 
 def with_depths(scene, distance=1.0):

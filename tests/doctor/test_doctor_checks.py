@@ -225,7 +225,7 @@ def cropped(center):
         ("focal", lambda focal: torch.tensor([1.0, 1.3]) * focal, "field of view", "look", "not square"),
         ("c2w", lambda c2w: rolled(c2w, 1), "upright", "look", "on their side"),
         ("c2w", lambda c2w: rolled(c2w, 2), "upright", "look", "on their head"),
-        ("c2w", lambda c2w: c2w * torch.tensor([1.0, 1, 1, 0]), "rotations", "wrong", "stand at one place"),
+        ("c2w", lambda c2w: c2w * torch.tensor([1.0, 1, 1, 0]), "rotations", "wrong", "are at the same position"),
         ("c2w", lambda c2w: c2w * torch.tensor([-1.0, 1, 1, 1]), "rotations", "wrong", "no rotations"),
     ],
 )
@@ -261,7 +261,9 @@ def test_a_hole_in_a_ring_of_views_is_noted():
     cameras = replace(scene.cameras[kept], lens_model="pinhole")
     evidence = gather_evidence(ball_scene(12, 12))
     evidence = replace(evidence, scene=replace(evidence.scene, cameras=cameras))
-    judged(evidence, "coverage", "look", "gap of 112 degrees", "Photographs are missing around")
+    judged(
+        evidence, "coverage", "look", "gap of 112 degrees", "Take 12 more photographs between where ball_11 and ball_0"
+    )
 
 
 @pytest.mark.data
@@ -298,7 +300,7 @@ def test_what_is_wrong_stops_the_training_with_the_cure_and_what_else_is_wrong(v
         InputError, match=r"convention: every camera looks away\. Turn the poses\. Wrong, too: focal"
     ) as stop:
         gate.require_sound(ball_scene())
-    assert "doctor=off trains all the same" in str(stop.value)
+    assert "doctor=off trains anyway" in str(stop.value)
 
 
 def test_what_is_doubtful_is_said_and_training_goes_on(verdicts, caplog):
@@ -307,7 +309,7 @@ def test_what_is_doubtful_is_said_and_training_goes_on(verdicts, caplog):
     verdicts += [Check("overlap", "not judged", "too few details", "It needs more.")]
     gate.require_sound(ball_scene())
     assert "doctor: sharpness: 3 of 20 are blurred. Leave them out." in caplog.text
-    assert "2 checks find nothing wrong; not judged: overlap (doctor=off" in caplog.text
+    assert "2 checks found no problem; not judged: overlap (doctor=off" in caplog.text
 
 
 def test_the_one_advice_is_about_what_no_setting_makes_up_for():

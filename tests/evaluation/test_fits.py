@@ -1,4 +1,4 @@
-"""Colours and cameras that are fitted to a photograph before they are compared."""
+"""Colors and cameras that are fitted to a photograph before they are compared."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -148,7 +148,7 @@ def test_colours_differ_more_from_their_neighbours():
     found = sharpened(fitted, voxels, (3, 3, 3))
     torch.testing.assert_close(found[13], torch.full((4, 3), 1.0))
     torch.testing.assert_close(found[0], fitted[0])
-    torch.testing.assert_close(found[12], torch.full((4, 3), 0.25 - 0.5 * 0.5 / 5))  # beside it, with five neighbours
+    torch.testing.assert_close(found[12], torch.full((4, 3), 0.25 - 0.5 * 0.5 / 5))  # beside it, with five neighbors
     alone = sharpened(fitted[:1], voxels[:1], (3, 3, 3))
     torch.testing.assert_close(alone, fitted[:1])
 

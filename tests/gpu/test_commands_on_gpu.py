@@ -90,7 +90,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(ball, trainer, device, tmp_p
     finished(train(ball, trainer, tmp_path / "whole", *settings))
     finished(train(ball, trainer, tmp_path / "run", *settings, f"trainer.max_steps={STEPS // 2}"))
     output = finished(start("train", f"resume={tmp_path / 'run'}", f"trainer.max_steps={STEPS}", trainer))
-    assert f"going on from step {STEPS // 2}" in output
+    assert f"resuming from step {STEPS // 2}" in output
     states = [torch.load(tmp_path / name / "checkpoints/last.ckpt", weights_only=True) for name in ("run", "whole")]
     assert states[0]["nerf_lightning"]["progress"] == states[1]["nerf_lightning"]["progress"]
     name = "model.levels.fine.field.position_encoder.table"

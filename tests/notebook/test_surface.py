@@ -1,8 +1,6 @@
 """What `import nerf_lightning as nl` offers: read, load and render, train."""
 
-import ast
 import signal
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,12 +26,6 @@ def run(capture, tmp_path_factory):
     trained = nl.train("scene=npz", f"scene.path={capture}", f"paths.output_dir={folder}", *SMALL)
     assert HydraConfig.instance().cfg is theirs
     return trained
-
-
-def test_the_types_that_are_told_are_those_of_what_is_there():
-    stub = ast.parse(Path(nl.__file__).with_suffix(".pyi").read_text())
-    told = {each.names[0].asname: each.module for each in stub.body if isinstance(each, ast.ImportFrom)}
-    assert told == nl._OFFERED
 
 
 def test_a_folder_is_read_as_its_files_tell_or_as_it_is_named_and_so_is_an_archive(tmp_path, capture):
@@ -80,12 +72,18 @@ def test_a_view_is_rendered_by_number_name_and_camera_and_a_path_camera_by_camer
     assert (picture.rgb.shape, picture.depth.shape, picture.opacity.shape) == ((4, 6, 3), (4, 6), (4, 6))
     assert torch.equal(model.render(model.scene.view_names[2]).rgb, picture.rgb)
     assert torch.equal(model.render(-8).rgb, picture.rgb)
-    seen = model.render(model.in_frame(scene).cameras[2])
-    assert seen.rgb.shape == picture.rgb.shape
+    seen = model.render(scene.user_cameras[2])
+    torch.testing.assert_close(seen.rgb, picture.rgb, rtol=0, atol=1e-3)
     assert not torch.equal(model.render(2, background="black").rgb, model.render(2, background="white").rgb)
     cameras = run.model.path("orbit", num_frames=3, width=5, height=4)
     assert run.model.render(cameras[1]).depth.shape == (4, 5)
     assert run.model.render(cameras[1:2]).depth.shape == (4, 5)
+
+
+def test_a_model_is_exported_as_by_the_command(run, tmp_path):
+    assert run.model.export("cameras", tmp_path, images="photos")[0] == tmp_path / "transforms.json"
+    assert '"file_path": "photos/' in (tmp_path / "transforms.json").read_text()
+    assert run.model.export("cameras")[0].parent == run.folder / "export"
 
 
 @pytest.mark.parametrize(
@@ -97,6 +95,8 @@ def test_a_view_is_rendered_by_number_name_and_camera_and_a_path_camera_by_camer
         (lambda model: model.render(0, background="blue"), ("blue",)),
         (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
         (lambda model: model.path(num_frames=0), ("num_frames",)),
+        (lambda model: model.export("pages"), ("pages", "page")),
+        (lambda model: model.export("page", resolution=3), ("what.resolution=3",)),
         (lambda model: nl.load("nowhere"), ("no checkpoint",)),
     ],
 )

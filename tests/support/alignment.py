@@ -20,7 +20,7 @@ def umeyama(source, target):
 
 
 def pose_errors(found, true):
-    """Return the errors of aligned camera-to-world poses (n, 3, 4): of the centres, in true units, and degrees."""
+    """Return the errors of aligned camera-to-world poses (n, 3, 4): of the centers, in true units, and degrees."""
     scale, rotation, shift = umeyama(found[:, :, 3], true[:, :, 3])
     centres = scale * found[:, :, 3] @ rotation.T + shift
     turned = np.swapaxes(rotation @ found[:, :, :3], 1, 2) @ true[:, :, :3]

@@ -1,4 +1,4 @@
-"""A ball whose colour depends on where it is seen from, baked, and its page."""
+"""A ball whose color depends on where it is seen from, baked, and its page."""
 
 import base64
 import gzip
@@ -25,7 +25,7 @@ RADIUS = 0.6
 
 
 class ShinyField(SolidField):
-    """Its colour is its place, and its side that one looks from."""
+    """Its color is its place, and its side that one looks from."""
 
     def forward(self, points, features=None):
         rgb = 0.5 + 0.3 * points.positions + 0.2 * points.directions

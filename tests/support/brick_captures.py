@@ -39,7 +39,7 @@ UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 def plain_engine() -> list[Part]:
-    """The fire engine, all of one colour."""
+    """The fire engine, all of one color."""
     dull = replace(WHITE, specular=0.0, mirror=0.0)
     return [replace(part, material=dull) for part in fire_engine()]
 
@@ -140,7 +140,7 @@ def _some(thing: str, count: int, random: torch.Generator) -> Scene:
 
 
 def few(random: torch.Generator) -> Scene:
-    """Five to twelve neighbours."""
+    """Five to twelve neighbors."""
     scene = pool("engine")
     towards = torch.nn.functional.normalize(scene.cameras.c2w[:, :, 3], dim=-1)
     middle = towards[int(torch.randint(len(towards), (), generator=random))]
@@ -173,7 +173,7 @@ def cropped(random: torch.Generator) -> Scene:
 
 
 def noisy(random: torch.Generator) -> Scene:
-    """Opaque, each on a background of another colour, with the noise of a dark room."""
+    """Opaque, each on a background of another color, with the noise of a dark room."""
     scene = _some("engine", 24, random)
     rgba = scene.pixels.rgba.view(24, -1, 4).float()
     alpha, behind = rgba[..., 3:] / 255, 255 * torch.rand(24, 1, 3, generator=random)
@@ -187,7 +187,7 @@ def noisy(random: torch.Generator) -> Scene:
 KINDS: dict[str, Callable[[torch.Generator], Scene]] = {
     "few views": few,
     "many views": lambda random: _some("engine", 48, random),
-    "one colour": lambda random: _some("plain", 28, random),
+    "one color": lambda random: _some("plain", 28, random),
     "turned": turned,
     "cropped": cropped,
     "noisy": noisy,

@@ -28,7 +28,7 @@ def pose(view: int) -> list[list[float]]:
 
 
 def picture(view: int, width: int = 8, height: int = 8) -> np.ndarray:
-    """Return random RGBA; a quarter of the pixels are transparent, and keep their colour."""
+    """Return random RGBA; a quarter of the pixels are transparent, and keep their color."""
     rng = np.random.default_rng(view)
     rgba = rng.integers(0, 256, (height, width, 4), dtype=np.uint8)
     rgba[..., 3][rng.random((height, width)) < 0.25] = 0

@@ -23,7 +23,7 @@ def corner_poses(count):
 
 @cache
 def noise(side, seed):
-    """Return a grey picture (side, side) with blobs of several sizes."""
+    """Return a gray picture (side, side) with blobs of several sizes."""
     rng = np.random.default_rng(seed)
     total = np.zeros((side, side))
     for blob in (4, 8, 16, 32):
@@ -33,7 +33,7 @@ def noise(side, seed):
 
 
 def photograph(c2w, first_wall=0):
-    """Return what a camera sees of the corner as (HEIGHT, WIDTH) grey levels; other walls make another place."""
+    """Return what a camera sees of the corner as (HEIGHT, WIDTH) gray levels; other walls make another place."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     across, up = (columns - WIDTH / 2) / FOCAL, (HEIGHT / 2 - rows) / FOCAL
     directions = np.stack([across, up, -np.ones_like(up)], axis=-1) @ c2w[:, :3].T

@@ -54,7 +54,7 @@ class Compiled:
 
     def spilled(self) -> int:
         """Return the most bytes that a thread of any kernel keeps outside of registers."""
-        return max(_spilled(each) for each in self.kernels)
+        return max(resources(each)[1] for each in self.kernels)
 
 
 @contextmanager
@@ -107,12 +107,17 @@ class _Launcher:
         return launch
 
 
-def _spilled(compiled: Any) -> int:
+def resources(compiled: Any) -> tuple[int, int, int]:
+    """Return a thread's registers, its bytes that no register had room for, and a block's bytes of shared memory."""
+    shared = compiled.metadata.shared
     if "amdgcn" in compiled.asm:
-        return 4 * int(re.search(r"\.vgpr_spill_count:\s+(\d+)", compiled.asm["amdgcn"])[1])
+        counts = (re.search(rf"\.vgpr_{what}:\s+(\d+)", compiled.asm["amdgcn"]) for what in ("count", "spill_count"))
+        registers, spilled = (int(found[1]) for found in counts)
+        return registers, 4 * spilled, shared
     tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(compiled.asm["cubin"])
         file.flush()
         told = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
-    return int(re.search(r"STACK:(\d+)", told)[1])
+    registers, spilled = re.search(r"REG:(\d+) STACK:(\d+)", told).groups()
+    return int(registers), int(spilled), shared

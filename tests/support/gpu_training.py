@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
+from omegaconf import OmegaConf
 from support.configs import composed
 from support.scenes import ball_scene as many_views
 
@@ -20,6 +21,15 @@ from nerf_lightning.training.step import TrainStep
 RAYS = 48
 # Opaque matter is cut off where nothing can be seen of it any more: GPUs do not cut, and the losses are compared.
 CUT = 1e-6
+QUICK = {
+    "num_samples": 16,
+    "log2_table_size": 10,
+    # Of grids, which are updated after 3 and after 6 steps, then half of them.
+    "resolution": 16,
+    "num_steps": 32,
+    "update_every": 3,
+    "warmup_steps": 4,
+}
 
 
 @dataclass
@@ -63,3 +73,18 @@ def step_by_step(
 def default_callbacks(*changes: str):
     """Return the callbacks that `nerf train` has."""
     return list(build(composed("train", *changes).callbacks).values())
+
+
+def small(model, **settings):
+    """Return the changes that make a model quick: `QUICK`, and other settings, by the last word of their keys."""
+    chosen = QUICK | settings
+
+    def within(place, settings):
+        for name, value in settings.items():
+            if isinstance(value, dict):
+                yield from within(f"{place}.{name}", value)
+            elif name in chosen:
+                yield f"{place}.{name}={chosen[name]}"
+
+    config = OmegaConf.to_container(composed("train", f"model={model}"), resolve=False)
+    return ["data.batch_rays=8", *within("model", config["model"]), *within("encoder", config["encoder"])]

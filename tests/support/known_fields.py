@@ -29,7 +29,7 @@ def red_and_green(positions: torch.Tensor) -> torch.Tensor:
 
 
 class SolidField(Field):
-    """Dense where a signed distance is negative; the same colour from all sides."""
+    """Dense where a signed distance is negative; the same color from all sides."""
 
     def __init__(self, distance: Distance, color: Callable = red_and_green, inside: float = INSIDE):
         super().__init__()

@@ -8,7 +8,7 @@ from PIL import Image
 from support.posed_captures import Known, photograph
 
 SPLIT_AT = 6
-"""The first views are learnt from where a format has splits."""
+"""The first views are learned from where a format has splits."""
 
 
 def put(path: Path, view: int, known: Known) -> None:
@@ -37,7 +37,7 @@ def write_blender(root: Path, known: Known, opaque: bool, folder: str = "", top:
 
 
 def write_ply(path: Path, points: np.ndarray, form: str, extra: bool = False, kind: str = "float") -> Path:
-    """Write points, behind a normal and before colours where `extra` says so."""
+    """Write points, behind a normal and before colors where `extra` says so."""
     names = ["nx", "x", "y", "z", "red"] if extra else ["x", "y", "z"]
     types = ["float", kind, kind, kind, "uchar"] if extra else [kind] * 3
     code = {"float": "f4", "double": "f8", "uchar": "u1"}

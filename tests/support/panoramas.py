@@ -44,7 +44,7 @@ def near_the_bricks(count: int, distance: float = 2.2) -> torch.Tensor:
 
 
 def traced(views: list[Pinhole], background: float = 1.0) -> np.ndarray:
-    """Pictures over a grey, from 0 to 1."""
+    """Pictures over a gray, from 0 to 1."""
     size = views[0].resolution
     rgba = tracer().pictures(views).reshape(len(views), size, size, 4) / 255.0
     return rgba[..., :3] * rgba[..., 3:] + background * (1.0 - rgba[..., 3:])

@@ -26,7 +26,7 @@ def with_jumping_ball(scene: Scene, radius: float = 0.14, seed: int = 0) -> Scen
         y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         across, down = (x - middle[0]) / size, (y - middle[1]) / size
         towards = (1.0 - across.square() - down.square()).clamp(min=0.0).sqrt()
-        # Lit from the upper left, of one colour in all photographs.
+        # Lit from the upper left, of one color in all photographs.
         light = (0.25 + 0.75 * (0.7 * towards - 0.5 * across - 0.5 * down).clamp(0.0, 1.0))[..., None]
         ball = torch.cat([light * torch.tensor([0.2, 0.9, 0.3]), torch.ones(height, width, 1)], dim=-1)
         inside = across.square() + down.square() < 1.0

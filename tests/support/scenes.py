@@ -26,7 +26,7 @@ LENSES = [
 def ball_scene(
     num_views: int = 6, size: int = 12, background: str = "white", lens=(0.0,) * 6, lens_model="pinhole"
 ) -> Scene:
-    """A ball whose colour is its normal, seen from a circle; half the views train, the rest validate and test."""
+    """A ball whose color is its normal, seen from a circle; half the views train, the rest validate and test."""
     angle = torch.linspace(0, 2 * torch.pi, num_views + 1)[:-1]
     eyes = 4.0 * torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.4)], dim=-1)
     c2w = look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.0, 0.0, 1.0]))
@@ -80,7 +80,7 @@ def tiny_model(**changes) -> RadianceModel:
 
 
 def some_rays(count: int, generator: torch.Generator | None = None) -> RayBundle:
-    """Rays from a sphere of radius 4 towards the middle."""
+    """Rays from a sphere of radius 4 toward the middle."""
     eyes = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1) * 4
     aim = 0.3 * torch.randn(count, 3, generator=generator)
     directions = torch.nn.functional.normalize(aim - eyes, dim=-1)

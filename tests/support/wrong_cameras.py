@@ -22,6 +22,6 @@ def with_noise(scene, degrees, share, views=None, seed=0):
 
 
 def mean_errors(found, true, views):
-    """Mean errors of aligned training cameras: of their centres, in true units, and in degrees."""
+    """Mean errors of aligned training cameras: of their centers, in true units, and in degrees."""
     found, true = (poses[list(views)].detach().double().numpy() for poses in (found, true))
     return [float(np.mean(errors)) for errors in pose_errors(found, true)]

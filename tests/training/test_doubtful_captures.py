@@ -6,7 +6,7 @@ from support.captures import npz_content, picture, write_blender, write_npz
 from support.posed_captures import Known, ring, write_transforms
 from support.running import FAST
 
-from nerf_lightning.training.build_run import build_run
+from nerf_lightning import build_run
 
 FEW = "number of views"
 

@@ -8,9 +8,8 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from support.configs import composed, options
-from support.gpu_training import step_by_step
+from support.gpu_training import small, step_by_step
 from support.stand_in_device import StandInDevice
 
 from nerf_lightning.nerf.kernels import backends
@@ -20,15 +19,6 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
-SETTINGS = {
-    "num_samples": 16,
-    "log2_table_size": 10,
-    # Of grids, which are updated after 3 and after 6 steps, then half of them.
-    "resolution": 16,
-    "num_steps": 32,
-    "update_every": 3,
-    "warmup_steps": 4,
-}
 TILE_POINTS = 128
 
 # At the first update the host reads which cells there are, and how large; it sends their numbers.
@@ -49,20 +39,6 @@ ALWAYS = (*SINGLE, "fast_proposal", "view_transformer_tiny")  # one of each kind
 
 def marked(*model):
     return pytest.param(*model, marks=() if model[0] in ALWAYS else pytest.mark.minutes)
-
-
-def small(model):
-    """Return the changes that make a model quick."""
-
-    def within(place, settings):
-        for name, value in settings.items():
-            if isinstance(value, dict):
-                yield from within(f"{place}.{name}", value)
-            elif name in SETTINGS:
-                yield f"{place}.{name}={SETTINGS[name]}"
-
-    config = OmegaConf.to_container(composed("train", f"model={model}"), resolve=False)
-    return ["data.batch_rays=8", *within("model", config["model"]), *within("encoder", config["encoder"])]
 
 
 def run_on(there, model, precision):

@@ -60,7 +60,7 @@ def fitted(tmp_path_factory):
     logger = CSVLogger(folder)
     trainer = quiet(max_steps=3, val_check_interval=3, logger=logger, callbacks=callbacks, default_root_dir=folder)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Lightning's advice about saving with manual optimisation
+        warnings.simplefilter("ignore")  # Lightning's advice about saving with manual optimization
         trainer.fit(run.system, run.data)
     return run, trainer, bar, outputs, folder
 

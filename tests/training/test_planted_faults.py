@@ -1,4 +1,4 @@
-"""What is wrong with a capture is learnt and set right: faults planted on bricks, trainings of some minutes each."""
+"""What is wrong with a capture is learned and set right: faults planted on bricks, trainings of some minutes each."""
 
 import pytest
 import torch
@@ -58,7 +58,7 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
         for each in (scene.cameras.c2w, step.rays.cameras.c2w)
     )
     assert after[1] < before[1] / 5, "degrees"
-    assert after[0] < before[0] / 4, "centres"
+    assert after[0] < before[0] / 4, "centers"
 
 
 def test_exposures_are_told_from_the_scene():

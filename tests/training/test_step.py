@@ -142,7 +142,7 @@ def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thr
     assert torch.allclose(got_losses, losses)
     assert tried[0] == 64
     assert tried[-1] <= 20
-    assert "from now on tiles of" in caplog.text
+    assert "out of memory: reducing tiles to" in caplog.text
 
 
 def test_without_memory_for_a_single_ray_the_run_ends_with_advice():

@@ -202,7 +202,7 @@ def test_each_output_shows_what_it_says():
     up = torch.tensor([0.0, 0.0, 1.0]).expand(20, 30, 3)
     assert shown("normals", up)[0, 29].tolist() == [128, 128, 255]
     left = shown("normals", up)[0, 0].tolist()
-    assert left == [left[0]] * 3, "grey where nothing is"
+    assert left == [left[0]] * 3, "gray where nothing is"
     same = panel("levels", Picture(RGB, SEEN.depth, OPACITY, first_rgb=RGB), (1.0, 3.0), 1.0, None)
     assert len(same[:, :30].reshape(-1, 3).unique(dim=0)) == 1
     assert len(shown("levels")[:, :30].reshape(-1, 3).unique(dim=0)) > 1

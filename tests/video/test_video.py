@@ -21,7 +21,7 @@ from nerf_lightning.video.encoding import pad_to_even, write_animation, write_vi
 from nerf_lightning.video.film import film
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.settings import FilmSettings, film_settings
-from nerf_lightning.video.shots import Subject, make_shots
+from nerf_lightning.video.shots import Subject, content_of, make_shots
 
 COLORS = [(220, 40, 40), (40, 180, 60), (30, 60, 200), (250, 250, 250)]
 
@@ -300,3 +300,11 @@ def test_other_outputs_are_refused(changes):
     assert film_settings(PLAIN | {"format": "exr"}).form == "exr"
     with pytest.raises(InputError, match="format=exr holds rgb and depth as numbers"):
         film_settings(PLAIN | {"format": "exr"} | changes)
+
+
+def test_the_content_of_a_film_is_what_photographs_show_in_their_middle():
+    above = ball(0.1, center=(0.0, 0.0, 1.2))
+    both = solid(lambda positions: torch.minimum(ball(0.5)(positions), above(positions)))
+    points = content_of(Subject(both, scene_record(ball_scene(num_views=8, size=33)), "white"), 1 << 15)
+    assert len(points) > 100
+    assert (points.norm(dim=-1) - 0.5).abs().max() < 0.05

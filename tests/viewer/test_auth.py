@@ -57,7 +57,7 @@ def test_another_host_is_refused_although_it_has_the_token(page):
 def test_who_has_no_token_is_told_where_it_is(page, query):
     status, headers, text = page.get(f"/{query}")
     assert (status, "Set-Cookie" in headers) == (403, False)
-    assert "the address with ?token= that nerf printed when it started" in text
+    assert "open the whole address that nerf printed, with ?token=" in text
     address = f"http://127.0.0.1:{page.port}/{query}"
     cookie = {"Cookie": f"nerf_lightning_{page.port}=none"}
     assert "that nerf printed" in refused(lambda: ViserClient(address, additional_headers=cookie))

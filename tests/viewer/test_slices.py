@@ -148,7 +148,7 @@ def plane():
 def test_every_channel_has_the_views_size_and_shows_what_it_is(plane):
     picture = picture_of(plane, "normals")
     assert picture[6, 6].tolist() == pytest.approx([128, 255, 128], abs=1)
-    assert picture_of(plane, "colour")[0, 0].tolist() == [128, 128, 128]
+    assert picture_of(plane, "color")[0, 0].tolist() == [128, 128, 128]
     assert picture_of(plane, "opacity").min() == 255
     picture = picture_of(plane, "depth").float().sum(dim=-1)
     assert picture[6, 6] > picture[0, 0]

@@ -19,7 +19,6 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import former_config, job_folder
-from nerf_lightning.training.build_run import Run, assemble
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
@@ -28,6 +27,7 @@ from nerf_lightning.training.callbacks.training_time import TrainingTime
 from nerf_lightning.training.launch.processes import require_one_task
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.loggers import WeightsAndBiases
+from nerf_lightning.training.run import Run, assemble
 
 
 @dataclass
@@ -48,17 +48,21 @@ class TrainJob(Run):
     post_training: PostTraining
 
 
-def build_job(asked: DictConfig) -> TrainJob:
-    """Build what a command's config asks for, and read its scene; nothing is written (`assemble_job`)."""
+def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
+    """Build what a command's config asks for, and read its scene if none is given; nothing is written."""
     hydra = HydraConfig.get()
     # What is left open is composed again, and may lie where the command line has said.
     overrides = [*searchpath_override(), *hydra.overrides.task]
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
-    return assemble_job(asked, hydra.runtime.choices, overrides, former)
+    return assemble_job(asked, hydra.runtime.choices, overrides, former, scene)
 
 
 def assemble_job(
-    asked: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], former: Mapping[str, Any] | None = None
+    asked: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    former: Mapping[str, Any] | None = None,
+    scene: Scene | None = None,
 ) -> TrainJob:
     """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
 
@@ -76,12 +80,13 @@ def assemble_job(
     for each in loggers.values() if ranks.is_first() else ():
         if isinstance(each, WeightsAndBiases):
             each.require_access()
-    scene: Scene = build(asked.scene).read()
+    scene = build(asked.scene).read() if scene is None else scene
     post_training.require_film(scene)
-    config, picked = resolve_auto(asked, choices, overrides, scene)
+    config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type == "cuda", former)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
     run = assemble(config, picked, settings, scene)
+    post_training.require_density(run.system.model)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     signals, clock = StopSignals(), TrainingTime()
     if config.print_config and ranks.is_first():

@@ -10,15 +10,15 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.exporters import exporters_after_training
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
-from nerf_lightning.export.page import QUALITIES, PageExport
+from nerf_lightning.export.base import Export
 from nerf_lightning.messages.console import say
-from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import Model, show_photographs
+from nerf_lightning.nerf.models.base import Model, point_field, show_photographs
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
@@ -40,8 +40,8 @@ class PostTraining:
 
     scoring: Scoring | None
     path: CameraPath | None
-    page: PageExport | None = None
-    """Is made after all that happens here, by the command."""
+    exports: dict[str, Export]
+    """By name; they write after all that happens here, by the command."""
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "PostTraining":
@@ -49,8 +49,13 @@ class PostTraining:
         scoring, path = build(config.evaluation), build(config.path)
         if config.final.video:
             require_ffmpeg()
-        page = _page(config.final.page)
-        return cls(scoring if config.final.evaluate else None, path if config.final.video else None, page)
+        exports = exporters_after_training(config.final)
+        return cls(scoring if config.final.evaluate else None, path if config.final.video else None, exports)
+
+    def require_density(self, model: Model) -> None:
+        """Refuse exports of what a model does not have."""
+        if any(export.needs_density for export in self.exports.values()):
+            point_field(model)
 
     def require_film(self, scene: Scene) -> None:
         """Refuse a path that cannot be laid around the scene, or frames for which there is no memory."""
@@ -67,7 +72,9 @@ class PostTraining:
         tile_points = settings.inference_tile_points
         scene, moved = _with_learnt_cameras(scene, trainer)
         with torch.no_grad():
-            if self.scoring is not None:
+            if self.scoring is not None and not scene.splits.get(self.scoring.split):
+                lines.append(f"not measured: the scene has no {self.scoring.split} views")
+            elif self.scoring is not None:
                 system: Any = trainer.lightning_module
                 config, choices = system.record["config"], system.record["choices"]
                 how = settings.device, settings.precision, trainer.global_step
@@ -94,17 +101,8 @@ class PostTraining:
         return None if psnr is None else float(psnr)
 
 
-def _page(asked: bool | str) -> PageExport | None:
-    if isinstance(asked, bool):
-        return PageExport() if asked else None
-    for quality in QUALITIES:
-        if quality == asked:
-            return PageExport(quality)
-    raise InputError(f"final.page={asked}: give true, false, or the quality of a page: {', '.join(QUALITIES)}.")
-
-
 def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:
-    """Return the scene with the cameras that the run has learnt, and what a person reads about them."""
+    """Return the scene with the cameras that the run has learned, and what a person reads about them."""
     system: Any = trainer.lightning_module
     trained = scene.splits["train"]
     learnt = system.rays.refined(trained)
@@ -128,9 +126,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
-    fitted = (
-        "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB once each picture's colours are fitted"
-    )
+    fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
         f"({metrics['num_images']} views, {protocol['background']} background)",

@@ -15,6 +15,8 @@ from nerf_lightning.commands.train_job.run_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.models.tiles import is_device_failure
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
@@ -27,6 +29,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
 
     Raises:
         SystemExit: a signal stopped the training, which was saved (128 + signal).
+        InputError: the GPU has failed.
     """
     former = folder.former
     _keep_end(job, folder)
@@ -36,14 +39,30 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
     if former is None:
         describe_run(trainer.loggers, job.config)
     checkpoint = None if former is None else former.checkpoint
-    trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
+    try:
+        trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
+    except RuntimeError as error:
+        if not is_device_failure(error):
+            raise
+        trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
+        raise InputError(
+            f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
+            f"{_what_is_left(folder)} If it fails again, nerf selftest tells whether the GPU computes right, and "
+            "trainer=cpu does without it."
+        ) from error
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
         log.info("%d steps in %s", steps, spoken(job.clock.seconds))
     if job.signals.received is not None:
-        log.info("stopped at step %d; go on with: %s", trainer.global_step, resume_command(folder.path))
+        log.info("stopped at step %d; resume with: %s", trainer.global_step, resume_command(folder.path))
         raise SystemExit(128 + job.signals.received)
     return trainer
+
+
+def _what_is_left(folder: HeldFolder) -> str:
+    if not any((folder.path / "checkpoints").glob("*.ckpt")):
+        return "Nothing was saved yet: begin anew."
+    return f"Go on from the last checkpoint with: {resume_command(folder.path)}."
 
 
 def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
@@ -65,7 +84,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     """Put the model on its device, in the precision and with the tile that suit it, or that the run began with."""
     step, settings, former = job.system.step, job.settings, folder.former
     if former is not None:
-        log.info("going on from step %d of %s", former.step, folder.path)
+        log.info("resuming from step %d of %s", former.step, folder.path)
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
         step.tile_points = settings.tile_points
@@ -97,11 +116,11 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         "whole batches" if tile is None else f"tiles of {tile} points",
     )
     if folder.former is None and job.config.resume == "auto":
-        log.info("resume=auto: there is no unfinished run of this config to go on with; this one begins anew")
+        log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new one")
     own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
     if own:
         log.info(
-            "the model has parts of your own: a command that opens its checkpoints builds them only with trust=%s",
+            "the model has parts of your own: commands that open its checkpoints need trust=%s",
             own[0] if len(own) == 1 else f"[{','.join(own)}]",
         )
 

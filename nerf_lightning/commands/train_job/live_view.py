@@ -48,12 +48,12 @@ class LiveView(Callback):
     training reads is changed.
 
     Args:
-        host: the address to listen on; 127.0.0.1 is heard by this machine alone.
+        host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
         port: the port, or the first to try.
-        share: largest part of the time that goes into pictures.
-        refresh_seconds: time between two pictures of the same view.
-        max_height: the finest picture, in pixels.
-        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1], like gate.example.
+        share: maximum share of the time spent on rendering.
+        refresh_seconds: seconds between two renders of the same view.
+        max_height: height of the finest image, in pixels.
+        hosts: names under which browsers reach the page, besides 127.0.0.1, localhost and [::1], such as gate.example.
 
     Raises:
         InputError: no viser, no place to listen, or a host that is none.

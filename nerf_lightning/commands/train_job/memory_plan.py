@@ -146,7 +146,7 @@ def announce_memory(settings: TrainerSettings, step: TrainStep, data: RayDataMod
         log.debug("%s", line)
     if plan.total > SMALL * plan.free:
         log.info(
-            "memory: at most about %.1f GB beside the %.1f GB that the process holds now; %.1f GB are free (-v: more)",
+            "memory: at most about %.1f GB on top of the %.1f GB in use by this process; %.1f GB are free (-v: more)",
             plan.total / GIGABYTE,
             held_memory(settings.device) / GIGABYTE,
             plan.free / GIGABYTE,

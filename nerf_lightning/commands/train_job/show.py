@@ -1,22 +1,22 @@
-"""What a person gets to see of a training: Lightning's profile, the page of the scene, the report of the run."""
+"""What a person gets to see of a training: Lightning's profile, exports of the scene, the report of the run."""
 
 import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.profilers import SimpleProfiler
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
-from nerf_lightning.checkpoints.recorded_frame import as_trained
-from nerf_lightning.commands.export import beside
+from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.config.open_checkpoint import LoadedModel, as_known
 from nerf_lightning.doctor.examine import advice
-from nerf_lightning.export.page import PageExport
+from nerf_lightning.export.base import Export
+from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.page import write_report
@@ -44,44 +44,47 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         say(*lines)
     for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
         log.info("profile: %s", profile)
-    if job.post_training.page is not None:
-        write_final_page(job.post_training.page, job, folder)
+    for name, what in job.post_training.exports.items():
+        export_trained(name, what, job, folder)
     if job.config.final.report:
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(f"report       {target}", *_result(job, psnr))
+        say(_result(job, target, psnr))
 
 
-def _result(job: TrainJob, psnr: float | None) -> list[str]:
-    """Return what came out of the photographs, and what would improve it most."""
-    used = len(job.scene.view_names)
+def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
+    """Return the last line: the page, what came out of the photographs, and what would improve it most."""
+    used, seconds = len(job.scene.view_names), job.config.budget.seconds
+    total = used + len(job.scene.left_out)
     quality = "" if psnr is None else f"{psnr:.1f} dB on photographs held out, "
-    lines = [f"result       {quality}{used} of {used + len(job.scene.left_out)} photographs used"]
-    cure = advice(job.checks or ())
-    return lines if cure is None else [*lines, f"to improve   {cure}"]
+    longer = "train longer" if seconds is None else f"budget.seconds={2 * seconds:g} trains twice as long"
+    cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
+    return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
 
 
-def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
-    """Write `page.html` into the folder of a run from its last checkpoint, or say why there is none."""
+def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None:
+    """Export the last checkpoint of a run as `nerf export` does, or say why that cannot be done."""
     try:
-        # From the file, as nerf export does: what was trained in bfloat16 is baked in float32.
+        # From the file, as nerf export does: what was trained in bfloat16 is read in float32.
         checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
-        model = load_model(checkpoint).to(job.settings.device).eval()
+        trained = LoadedModel(job.settings, checkpoint, load_model(checkpoint).to(job.settings.device).eval())
         path = job.config.path.copy()
         path.update(PATH)
-        what.beside = beside(checkpoint, as_trained(job.scene, checkpoint), build(path))
-        with torch.no_grad():
-            written = what.export(model, checkpoint.scene, folder, job.settings.inference_tile_points)
-        say(*(f"page         {file}" for file in written))
+        target = make_folder(folder, "export")
+        written = write_files(what, trained, as_known(job.scene, trained), build(path), target)
+        say(*(f"{name:<12} {file}" for file in written))
     except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         log.warning(
-            "The run is whole, but its page (final.page) could not be made: %s Once that is mended, "
-            "nerf export ckpt=%s what=page makes it.",
+            "The run is whole, but final.%s failed: %s nerf export ckpt=%s what=%s writes it later.",
+            name,
             reason if reason.endswith(".") else f"{reason}.",
             folder,
+            name,
         )
+    finally:
+        remove_empty(folder / "export")
 
 
 def profile_lines(trainer: Trainer) -> list[str]:

@@ -90,7 +90,7 @@ class Command:
 
 @cache
 def command_named(name: str) -> Command | None:
-    """Return a command's catalogue; None if there is no such command."""
+    """Return a command's catalog; None if there is no such command."""
     file = conf_file(name)
     return Command(name, read_commented(file)) if file.is_file() else None
 

@@ -1,4 +1,4 @@
-"""From light to colour: shadows of the key light, the openness of the surroundings, and what a surface makes of them.
+"""From light to color: shadows of the key light, the openness of the surroundings, and what a surface makes of them.
 
 Shadows and openness are exact whatever the culling: points are sorted into cells, and a cell asks only the parts that
 can matter.
@@ -19,8 +19,8 @@ from nerf_lightning.data.bricks.solids import Solids
 class Light:
     """What shines on a model: a key light, a fill light that casts no shadow, and the surroundings.
 
-    `key` is the unit vector towards the key light; an upward surface receives `sky_light`, a downward one
-    `ground_light`. Colours are linear.
+    `key` is the unit vector toward the key light; an upward surface receives `sky_light`, a downward one
+    `ground_light`. Colors are linear.
     """
 
     key: Float[ndarray, "3"]
@@ -55,13 +55,13 @@ LIFT = 1e-3
 """Shadow rays start this far above the surface."""
 SHADOW_CELL, PROBE_CELL = 0.12, 0.24
 FILL = np.array([-0.60, 0.66, 0.45]) / np.linalg.norm([-0.60, 0.66, 0.45])
-"""Towards the fill light, which casts no shadow."""
+"""Toward the fill light, which casts no shadow."""
 ZENITH, HORIZON, GROUND = (0.34, 0.52, 0.92), (1.00, 1.00, 1.00), (0.26, 0.22, 0.20)
-"""Linear colours of what surrounds the model, as surfaces mirror it."""
+"""Linear colors of what surrounds the model, as surfaces mirror it."""
 
 
 def _key_axes(light: Light) -> Float[ndarray, "3 3"]:
-    """Return rows across, across and towards the key light."""
+    """Return rows across, across and toward the key light."""
     across = np.cross([0.0, 0.0, 1.0], light.key)
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(light.key, across), light.key])
@@ -157,7 +157,7 @@ def shade(
     lit: Float[ndarray, "hits"],
     openness: Float[ndarray, "hits"],
 ) -> Float[ndarray, "3 hits"]:
-    """Return the sRGB-encoded colour of each hit.
+    """Return the sRGB-encoded color of each hit.
 
     Lambert plus a Blinn-Phong highlight of the key light (the half vector's cosine to the power of 2^sharpness),
     plus the mirrored surroundings with Schlick's Fresnel term: both change with the view.
@@ -191,7 +191,7 @@ def shade(
 
 
 def _surroundings(directions: Float[ndarray, "3 rays"]) -> Float[ndarray, "3 rays"]:
-    """Return the linear colour of the sky, of the ground, and of the soft step between them."""
+    """Return the linear color of the sky, of the ground, and of the soft step between them."""
     height = directions[2]
     sky = _mix(HORIZON, ZENITH, np.clip(height, 0, 1) ** 0.5)
     rise = np.clip((height + 0.12) / 0.16, 0, 1)

@@ -23,7 +23,7 @@ AXES = {"x": ALONG_X, "y": ALONG_Y, "z": ALONG_Z}
 
 @dataclass(frozen=True)
 class Material:
-    """A surface. Colours are sRGB-encoded."""
+    """A surface. Colors are sRGB-encoded."""
 
     color: Triple
     specular: float = 0.25

@@ -49,15 +49,15 @@ class BricksReader(Reader):
     """Render the embedded scene, with exact depth and normals.
 
     Args:
-        resolution: width and height of every picture in pixels.
+        resolution: width and height of every image in pixels.
         num_train: number of training views, spread over the upper hemisphere.
         num_val: number of validation views, in the gaps between the training views.
         num_test: number of test views, on an orbit.
-        near: distance from a camera at which content may begin; the model lies between 2.7 and 5.4.
+        near: distance from a camera at which content begins; the model lies between 2.7 and 5.4.
         far: distance at which content ends.
-        background: what the transparent pixels are blended with.
-        cache_dir: folder of the rendered pictures; by default in the user's cache folder
-            (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
+        background: the background of transparent pixels.
+        cache_dir: the folder of the rendered images; by default in the user's cache folder (`$NERF_LIGHTNING_CACHE`,
+            `$XDG_CACHE_HOME` or ~/.cache).
         name: the scene's name in reports.
     """
 

@@ -1,4 +1,4 @@
-"""Closed forms of convex solids centred at the origin of their own frame: ray intervals, distances and normals.
+"""Closed forms of convex solids centered at the origin of their own frame: ray intervals, distances and normals.
 
 A ray is inside a convex solid between two distances, so every solid here is an intersection of intervals. All
 functions broadcast: axis 0 of `origin`, `direction` (of unit length) and `point` is x, y, z; axis 0 of `size` is the

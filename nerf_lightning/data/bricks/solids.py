@@ -21,7 +21,7 @@ NOTHING = -1
 
 @dataclass(frozen=True)
 class Group:
-    """Parts of one kind of solid in one frame: centres in its axes, and each part's number in the model."""
+    """Parts of one kind of solid in one frame: centers in its axes, and each part's number in the model."""
 
     solid: Solid
     frame: Float[ndarray, "3 3"]

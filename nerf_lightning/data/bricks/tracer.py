@@ -50,7 +50,7 @@ class Found:
 
 
 class Tracer:
-    """Trace one model. Colours take float32, geometry float64."""
+    """Trace one model. Colors take float32, geometry float64."""
 
     def __init__(self, parts: Sequence[Part], light: Light = DAY) -> None:
         self.light = light
@@ -58,7 +58,7 @@ class Tracer:
         self.palette, self.corners = palette(parts, np.float32), self.solids.corners()
 
     def pictures(self, views: Sequence[Pinhole]) -> UInt8[ndarray, "views pixels 4"]:
-        """Return straight RGBA: alpha is the share of a pixel's 4 x 4 rays that hit, colour the mean of those hits.
+        """Return straight RGBA: alpha is the share of a pixel's 4 x 4 rays that hit, color the mean of those hits.
 
         The mean is taken over sRGB codes, because that is how radiance fields and viewers blend them. Views of one
         call share the search for shadows, which is faster and changes no value; they have one resolution.
@@ -78,7 +78,7 @@ class Tracer:
         return rgba.reshape(len(views), pixels, 4)
 
     def geometry(self, view: Pinhole) -> tuple[Float[ndarray, "pixels"], Float[ndarray, "pixels 3"]]:
-        """Return depth (inf: nothing) and world normals (zero: nothing) through the pixels' centres."""
+        """Return depth (inf: nothing) and world normals (zero: nothing) through the pixels' centers."""
         found = self.find(view, 1, self.solids)
         depth = np.full(view.resolution**2, np.inf, np.float32)
         normals = np.zeros((view.resolution**2, 3), np.float32)
@@ -87,7 +87,7 @@ class Tracer:
         return depth, normals
 
     def find(self, view: Pinhole, sides: int, solids: Solids) -> Found:
-        """Return the first hits of `sides` x `sides` rays through each pixel, centred in equal squares."""
+        """Return the first hits of `sides` x `sides` rays through each pixel, centered in equal squares."""
         upper, lower = view.rectangles(self.corners)
         tile = TILE_RAYS // sides
         found = [_trace_tile(view, 0, 0, 0, sides, solids)]

@@ -22,7 +22,7 @@ class View:
     name: str
     photograph: Photograph
     c2w: Float[Tensor, "3 4"]
-    """Camera to the user's world; right, up, back, centre; float64."""
+    """Camera to the user's world; right, up, back, center; float64."""
     focal: tuple[float, float]
     """In pixels of `size`."""
     center: tuple[float, float]
@@ -31,7 +31,7 @@ class View:
     lens: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, k3, k4, p1, p2."""
     depth: Path | None = None
-    """A grey picture of 16 bits whose levels are depths along the camera's axis; 0 is unknown."""
+    """A gray picture of 16 bits whose levels are depths along the camera's axis; 0 is unknown."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Capture:
     left_out: LeftOut = field(default_factory=lambda: LeftOut(""))
     """Views that cannot be used, and photographs that have no pose."""
     depth_unit: float = 1e-3
-    """How long a level of the views' depth maps is, in units of the capture; sensors count millimetres."""
+    """How long a level of the views' depth maps is, in units of the capture; sensors count millimeters."""
 
     def some(self, kept: Sequence[int]) -> "Capture":
         """Return some of the views, in order; the splits follow."""

@@ -48,7 +48,7 @@ def usable(capture: Capture) -> Capture:
     scaled = [scale for scale in scales if scale is not None]
     if scaled:
         log.warning(
-            "%s: the rotations of %d of %d poses are scaled (by %.4g, the first); the scale is removed, and the centres"
+            "%s: the rotations of %d of %d poses are scaled (by %.4g, the first); the scale is removed, and the centers"
             " stay",
             *(capture.source, len(scaled), len(views), scaled[0]),
         )
@@ -111,7 +111,7 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
         return "has a pose or intrinsics with NaN or infinity. Remove it, or estimate the poses anew."
     if max(x, y) > FARTHEST or float(view.c2w[:, 3].abs().max()) > FARTHEST:
         return (
-            f"has a focal length or a centre beyond {FARTHEST:g}, where no digit is left that a picture could show. "
+            f"has a focal length or a center beyond {FARTHEST:g}, where no digit is left that a picture could show. "
             "Export the cameras again, in units of about the scene's size."
         )
     if not min(x, y) >= LEAST_FOCAL or min(width, height) < 1:
@@ -132,7 +132,7 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
         )
     if not bool(is_rigid(view.c2w)):
         return (
-            "has a pose that is not a rotation and a centre, camera to world with axes right, up, back (it scales, "
+            "has a pose that is not a rotation and a center, camera to world with axes right, up, back (it scales, "
             "mirrors or shears along some axis). Export it again."
         )
     if lens_model in ("pinhole", "radial_tangential") and (reason := impossible_lens(view.size, view.focal)):
@@ -182,8 +182,8 @@ def check_metres(metres_per_unit: float | None) -> None:
     """Refuse a unit of no length, or beyond all digits."""
     if metres_per_unit is not None and not LEAST_UNIT <= metres_per_unit <= LARGEST_UNIT:
         raise InputError(
-            f"scene.metres_per_unit={metres_per_unit}: give how many metres one unit of the capture is long, such as "
-            "0.01 for centimetres, or null where that is unknown."
+            f"scene.metres_per_unit={metres_per_unit}: give how many meters one unit of the capture is long, such as "
+            "0.01 for centimeters, or null where that is unknown."
         )
 
 
@@ -272,11 +272,11 @@ def check_cameras(cameras: Cameras, place: str, where: str) -> None:
     """Refuse numbers that are no cameras; see `check_scene`.
 
     Raises:
-        Mismatch: a pose that is no rotation with a centre, or a size or a lens that none has.
+        Mismatch: a pose that is no rotation with a center, or a size or a lens that none has.
         InputError: a picture of more than `budgets.view_pixels`.
     """
     if not bool(is_rigid(cameras.c2w).all()):
-        raise Mismatch(f"{place}.c2w", "holds a pose that is not a rotation and a centre")
+        raise Mismatch(f"{place}.c2w", "holds a pose that is not a rotation and a center")
     sizes = torch.stack([cameras.width, cameras.height]).double()
     if float(sizes.min()) < 1:
         raise Mismatch(f"{place}.width", "is not above 0")

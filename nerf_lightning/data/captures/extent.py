@@ -1,4 +1,4 @@
-"""How much of space is modelled, the working frame of a capture, and where along its rays content may lie."""
+"""How much of space is modeled, the working frame of a capture, and where along its rays content may lie."""
 
 import math
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ ONE_PLACE = 1e-9
 # Of the cube that the ball of the cameras just holds.
 UNIT_BALL_HALF = 3**-0.5
 # The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
-# normalised device coordinates.
+# normalized device coordinates.
 LEAST_AHEAD = 0.1
 CONTRACTED_SIDE = 4.0
 """Of the cube that holds contracted space."""
@@ -76,7 +76,7 @@ def choose_space(
         return "ndc", "since all cameras look the same way and the capture gives depths"
     if ahead and cosine > FORWARD_FACING and len(capture.points):
         return "ndc", "since all cameras look the same way and sparse points give depths"
-    return "contracted", "since the photographs show whatever lies behind the content"
+    return "contracted", "since the photographs show a background"
 
 
 def least_ahead(cameras: Cameras) -> float:
@@ -106,7 +106,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     the user knows better.
 
     Raises:
-        InputError: all cameras stand at one place, near and far leave nothing, or the space does not suit the cameras.
+        InputError: all cameras are at one position, near and far leave nothing, or the space does not suit the cameras.
     """
     _check_places(capture, cameras)
     if space == "ndc":
@@ -156,7 +156,7 @@ def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Cap
     if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
         raise InputError(
             f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "
-            "is so small or so large. Mend applied_scale and applied_transform, or the cameras' distances."
+            "is so small or so large. Fix applied_scale and applied_transform, or the cameras' distances."
         )
 
 
@@ -177,8 +177,8 @@ def _check_places(capture: Capture, cameras: Cameras) -> None:
     spread = (centers - centers.mean(dim=0)).abs().max()
     if float(spread) <= ONE_PLACE * float(centers.abs().max()):
         raise InputError(
-            f"All {len(capture.views)} cameras of {capture.source} stand at one place, and without different places "
-            "nothing is known of depth. Photograph from several, or estimate the poses anew."
+            f"All {len(capture.views)} cameras of {capture.source} are at the same position, so they contain "
+            "no information about depth. Photograph from several positions, or estimate the poses again."
         )
 
 
@@ -208,7 +208,7 @@ def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "
         return torch.stack([corners.amin(dim=0), corners.amax(dim=0)]).float()
     if len(capture.points) >= FEWEST_POINTS:
         points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
-        # Alike towards all sides, so that it does not depend on where the user's x axis points.
+        # Alike toward all sides, so that it does not depend on where the user's x axis points.
         level = (1.0 + BOX_MARGIN) * torch.quantile(points[:, :2].norm(dim=-1), QUANTILES[1])
         low, high = torch.quantile(points[:, 2], points.new_tensor(QUANTILES))
         room = BOX_MARGIN * (high - low)
@@ -285,14 +285,14 @@ def model_for(scene: Scene) -> tuple[str, str]:
     """Return the model that suits a scene, as model=auto chooses it, and why."""
     if scene.space == "bounded":
         return IN_A_BOX, "the scene stands in a box"
-    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
+    return PHOTOGRAPHS, "the photographs show a background"
 
 
 def grid_for(scene: Scene) -> int:
     """Return the finest resolution of a hash grid whose cells are as small as the pixels.
 
     Half of the pixels are at least as wide, where they see the scene, as a cell: of the cube from -2 to 2 that all of
-    space is contracted to, or of normalised device coordinates, in which a picture has width 2. They see it where
+    space is contracted to, or of normalized device coordinates, in which a picture has width 2. They see it where
     sparse points or depths say; where there are none, as far away as the middle of the scene.
     """
     cameras, train = scene.cameras, torch.tensor(scene.splits["train"])

@@ -1,7 +1,6 @@
 """What all captures share: from a format's views to a scene in a working frame."""
 
 import logging
-import math
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -16,9 +15,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, contents, usable
-from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
-from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
+from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
 from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
@@ -28,11 +26,8 @@ from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
-Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 MOST_PIXELS = 640
 """Of the longer side of photographs whose size the user leaves open."""
 MOST_AROUND = 2048
@@ -55,25 +50,26 @@ class CaptureReader(Reader):
 
     Args:
         root: the capture's folder.
-        downscale: whole factor by which the photographs shrink; focal lengths follow. auto: so that their longer side
-            has at most 640 pixels, of which a few minutes on a CPU see enough.
-        hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
+        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that their
+            longer side has at most 640 pixels, enough for a few minutes on a CPU.
+        hold_every: the first and every k-th view after it are held out for evaluation, if the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
-        masks: a folder below root with masks, called like their photographs (or with .png added, or with .png for the
-            ending); a photograph without one is kept whole. null: no masks, or those that the format names.
-        masks_keep: the colour of masks that counts, white or black; the other is left out.
+        masks: a folder below root with masks, named like their photographs (or with .png added, or instead of the
+            extension); photographs without a mask are used whole. null: no masks, or those that the format names.
+        masks_keep: the color of masks that is kept, white or black; the other is ignored.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
-        near: distance at which content may begin, in the user's units; null: from the capture.
+        near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
-        metres_per_unit: how many metres a unit of the capture's frame is long, where it is known: then depths are told
-            in metres, and GLB files have their true size. No format of captures says it. null: unknown.
-        cut_out: where opaque photographs show a thing before one plain colour, make that transparent.
-        background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null:
-            black; where a plain background was cut out, white_or_random, black_or_random or random, as its colour is.
+        metres_per_unit: length of the capture's unit in meters, if known: depths are then in meters, and GLB files have
+            their true size. Capture formats do not store it. null: unknown.
+        cut_out: if opaque photographs show an object on a plain background, make that transparent.
+        background: the background of transparent pixels and of rays that leave the scene: white, black, random or none.
+            null: black; if a plain background was cut out, white_or_random, black_or_random or random, depending on its
+            color.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
-        allow_outside: follow names that lead out of root; false refuses them, since they may be a stranger's. Links
-            are followed always.
-        verify: compare the contents of all files with what was decoded, not their times alone.
+        allow_outside: follow names that lead out of root; false refuses them, because the capture may be untrusted.
+            Links are always followed.
+        verify: compare the contents of all files with the cache, not only their times.
         name: the scene's name in reports.
     """
 
@@ -103,7 +99,7 @@ class CaptureReader(Reader):
         """
 
     def read(self) -> Scene:
-        """Return the capture as a scene in a working frame: upright, centred, of a handy size.
+        """Return the capture as a scene in a working frame: upright, centered, of a handy size.
 
         Raises:
             InputError: a setting that makes no sense, or anything wrong with the files.
@@ -127,10 +123,6 @@ class CaptureReader(Reader):
         has_edge = capture.lens_model in ("pinhole", "radial_tangential")
         pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and self.background != "none")
         cameras = cameras_of(capture, files, pixels, downscale)
-        names = tuple(view.name for view in capture.views)
-        require_invertible(cameras, names)
-        space, reason = choose_space(self.space, cameras, capture, pixels.has_transparency)
-        log.info("%s: space=%s, %s", self.name, space, reason)
         protocol = {
             "downscale": str(downscale),
             "filter": "none" if downscale == 1 else "area, premultiplied",
@@ -138,30 +130,18 @@ class CaptureReader(Reader):
             "frames": self.frames or "all",
         }
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
-        extent = extent_of(capture, cameras, space, self.near, self.far)
-        to_user = capture.undo @ extent.to_user
-        depths = known_depths(capture, cameras)
-        if depths is not None:
-            depths = replace(depths, distance=(depths.distance / unit_of(extent.to_user)).float())
-        require_possible(extent, to_user, capture)
-        return Scene(
+        return scene_of(
+            capture,
+            cameras,
+            pixels,
+            splits,
             name=self.name,
-            cameras=replace(cameras, c2w=poses_from_user(cameras.c2w, extent.to_user).float(), ndc=extent.ndc),
-            pixels=pixels,
-            near=extent.near,
-            far=extent.far,
-            aabb=extent.aabb,
-            splits=splits,
-            view_names=names,
+            space=self.space,
+            near=self.near,
+            far=self.far,
             background=background_for(self.background, color, "black"),
-            space=space,
-            depths=depths,
-            points=points_from_user(capture.points, extent.to_user).float(),
-            to_user=to_user,
-            metres_per_unit=self.metres_per_unit,
             protocol=protocol | protocol_of(color) | remembered,
-            truth=None,
-            left_out=capture.left_out.names,
+            metres_per_unit=self.metres_per_unit,
         )
 
     def folder(self) -> Path:
@@ -248,16 +228,10 @@ class CaptureReader(Reader):
             check_step("downscale", self.downscale)
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
-        if self.space not in get_args(Spaces):
-            raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         check_metres(self.metres_per_unit)
         background_for(self.background, None, "black")
-        near, far = self.near, self.far
-        if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
-            raise InputError(
-                f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units."
-            )
+        check_extent(self.space, self.near, self.far)
 
     def _wanted(self, capture: Capture) -> Capture:
         """Return the views whose names fit the pattern `frames`."""
@@ -286,7 +260,7 @@ class CaptureReader(Reader):
             return {"train": train, "val": held, "test": held}
         if not splits["train"]:
             raise InputError(
-                f"{capture.source} names no view to learn from that is there. Mend its lists, or remove them so that "
+                f"{capture.source} names no view to learn from that is there. Fix its lists, or remove them so that "
                 f"every {self.hold_every}th view is held out."
             )
         held = splits["val"] or splits["test"]

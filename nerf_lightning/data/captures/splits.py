@@ -1,4 +1,4 @@
-"""Which views are learnt from and which are held out."""
+"""Which views are learned from and which are held out."""
 
 import logging
 from collections.abc import Callable, Hashable, Sequence
@@ -7,7 +7,7 @@ from typing import TypeVar
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
-MEMORISED = {"test_views": "learnt from"}
+MEMORISED = {"test_views": "learned from"}
 """Stands in the protocol of numbers that say how well photographs are remembered, and nothing of new views."""
 
 View = TypeVar("View", bound=Hashable)
@@ -70,10 +70,10 @@ def apart(
         raise InputError(
             f"{source}: {len(both)} of {len(train)} views to learn from are to be judged by, too ({names}), and "
             f"without them {left} would be left. Take them out of the lists to judge by (val, test) if they are "
-            "to be learnt from, or out of the list to learn from."
+            "to be learned from, or out of the list to learn from."
         )
     log.warning(
-        "%s: %d of %d views are listed both to learn from and to judge by, and are not learnt from: %s",
+        "%s: %d of %d views are listed both to learn from and to judge by, and are not learned from: %s",
         source,
         len(both),
         len(train),

@@ -53,7 +53,7 @@ class Photograph:
 
     path: Path
     mask: Path | None = None
-    """A grey picture of the same size, white (brighter than 127) and black."""
+    """A gray picture of the same size, white (brighter than 127) and black."""
     mask_keeps: MaskColor = "white"
     upright: bool = False
     """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
@@ -207,14 +207,14 @@ def _mask(
         white = photograph.mask_keeps == "white"
         raise InputError(
             f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is "
-            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Mend the "
+            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Fix the "
             f"mask, leave this view out, or turn all masks round with scene.masks_keep={'black' if white else 'white'}."
         )
     return kept
 
 
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:
-    """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbour."""
+    """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbor."""
     if (pixels.shape[1], pixels.shape[0]) != size:
         raise InputError(f"{path} changed while it was read. Start again when it is no longer written to.")
 

@@ -82,7 +82,7 @@ def read_header(path: Path) -> PictureHeader:
 
     Raises:
         InputError: the file is absent, empty, of no known format, too large to be decoded safely, holds several
-            pictures, or has a pixel mode with no plain reading as 8-bit colour.
+            pictures, or has a pixel mode with no plain reading as 8-bit color.
     """
     with _opened(path) as image:
         try:
@@ -111,7 +111,7 @@ def is_heic(path: Path) -> bool:
 def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height width 4"]:
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
-    Palettes and grey levels are expanded. Of 16 bits the upper byte is kept (less than one level off), which is said
+    Palettes and gray levels are expanded. Of 16 bits the upper byte is kept (less than one level off), which is said
     once for each folder.
 
     Args:
@@ -151,14 +151,14 @@ def _say_reduced(folder: Path) -> None:
 
 
 def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
-    """Return the levels of a grey picture of 16 bits, as depth sensors write it.
+    """Return the levels of a gray picture of 16 bits, as depth sensors write it.
 
     Raises:
         InputError: what `read_header` refuses, damaged, or of another kind.
     """
     with _opened(path) as image:
         if image.mode not in GREY_16:
-            raise InputError(f"The depth map {path} is no grey picture of 16 bits. Save it as a 16-bit PNG.")
+            raise InputError(f"The depth map {path} is no gray picture of 16 bits. Save it as a 16-bit PNG.")
         try:
             return np.asarray(image).astype(np.uint16)
         except DECODER_ERRORS as error:
@@ -180,8 +180,8 @@ def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> B
     bright = [channel > KEEP_ABOVE for channel in said]
     if any((channel != bright[0]).any() for channel in bright[1:]):
         raise InputError(
-            f"The mask {path} has colours or transparent pixels, so which pixels it keeps is not clear. Save it as a "
-            f"grey picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
+            f"The mask {path} has colors or transparent pixels, so which pixels it keeps is not clear. Save it as a "
+            f"gray picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
         )
     return bright[0] if keep == "white" else ~bright[0]
 
@@ -224,8 +224,8 @@ def area_downscale(
 ) -> UInt8[np.ndarray, "small_height small_width 4"]:
     """Return the picture shrunk by a whole factor: each pixel is the mean of its block, premultiplied.
 
-    colour = sum(rgb * a) / sum(a), alpha = mean(a), both rounded to 8 bits (halves up) and kept straight;
-    colour is 0 where alpha is. The sums are integers, hence exact. `factor` must divide the size.
+    color = sum(rgb * a) / sum(a), alpha = mean(a), both rounded to 8 bits (halves up) and kept straight;
+    color is 0 where alpha is. The sums are integers, hence exact. `factor` must divide the size.
     """
     if factor == 1:
         return rgba
@@ -329,7 +329,7 @@ def jpeg_scans(content: bytes | mmap.mmap) -> int:
 
 
 def _check_plain(image: Image.Image, path: Path) -> None:
-    """Refuse several pictures in one file, and pixel modes that are no 8-bit colour."""
+    """Refuse several pictures in one file, and pixel modes that are no 8-bit color."""
     frames = _num_frames(image, path)
     if frames > 1:
         raise InputError(
@@ -338,12 +338,12 @@ def _check_plain(image: Image.Image, path: Path) -> None:
         )
     if image.mode == "CMYK":
         raise InputError(
-            f"{path} has CMYK colours, which are for printing, and no one reading as RGB. Convert it with its colour "
+            f"{path} has CMYK colors, which are for printing, and no one reading as RGB. Convert it with its color "
             f"profile, for example `magick {path.name} -colorspace sRGB {path.stem}.png`."
         )
     if image.mode not in MODES + GREY_16:
         raise InputError(
-            f"{path} has the pixel mode {image.mode!r}, which has no plain reading as 8-bit colour. "
+            f"{path} has the pixel mode {image.mode!r}, which has no plain reading as 8-bit color. "
             "Save it as an 8-bit RGB or RGBA PNG."
         )
 

@@ -1,4 +1,4 @@
-"""Photographs of a thing before one plain colour, without alpha: the colour is found, and made transparent."""
+"""Photographs of a thing before one plain color, without alpha: the color is found, and made transparent."""
 
 import hashlib
 import logging
@@ -23,7 +23,7 @@ Color = tuple[int, int, int]
 TOLERANCE = 2
 """Levels of 255 by which a pixel of the background may be off."""
 EDGE_SHARE, VIEW_SHARE = 0.9, 0.9
-"""So much of a photograph's edge has the colour, and so many of the photographs are such."""
+"""So much of a photograph's edge has the color, and so many of the photographs are such."""
 LEAST_SHARE = 0.1
 """Of the pixels that the background has; less is a frame around the pictures."""
 ALIKE = 0.9
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 
 def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Color | None]:
-    """Return the photographs with the plain background made transparent, and its colour; as they are if there is none.
+    """Return the photographs with the plain background made transparent, and its color; as they are if there is none.
 
-    Transparent is what has the colour and hangs together with the picture's edge, so that a thing of the same colour
-    within the content stays. Colours are not changed: over a background of that colour the photographs look as before,
+    Transparent is what has the color and hangs together with the picture's edge, so that a thing of the same color
+    within the content stays. Colors are not changed: over a background of that color the photographs look as before,
     to a level of 255. A store in memory is written to; of a mapped one another is made beside it.
 
     Args:
@@ -64,7 +64,7 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
 
 
 def in_words(color: Color) -> str:
-    """Return a colour as people say it.
+    """Return a color as people say it.
 
     >>> in_words((255, 254, 255)), in_words((0, 0, 2)), in_words((90, 120, 90))
     ('white', 'black', 'rgb(90, 120, 90)')
@@ -80,9 +80,9 @@ def protocol_of(color: Color | None) -> dict[str, str]:
 
 
 def background_for(asked: str | None, color: Color | None, otherwise: Background) -> Background:
-    """Return the background that was asked for; None: `otherwise`, or what suits the colour that was cut out.
+    """Return the background that was asked for; None: `otherwise`, or what suits the color that was cut out.
 
-    Before one colour throughout, sheets of that colour may grow before the content until nothing else is left; drawn
+    Before one color throughout, sheets of that color may grow before the content until nothing else is left; drawn
     anew for each ray, backgrounds forbid them.
     """
     if asked is not None:
@@ -94,9 +94,9 @@ def background_for(asked: str | None, color: Color | None, otherwise: Background
 
 
 def plain_color(pixels: PixelStore) -> Color | None:
-    """Return the one colour that lies behind the content of all photographs; None where there is no such thing.
+    """Return the one color that lies behind the content of all photographs; None where there is no such thing.
 
-    It is the colour of nearly all edges. A frame that is the same in all photographs, such as a lens's dark rim or a
+    It is the color of nearly all edges. A frame that is the same in all photographs, such as a lens's dark rim or a
     film's black bars, is no background; nor is anything in photographs that have alpha or masks, whose makers have said
     what counts.
     """
@@ -125,7 +125,7 @@ def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
 
 
 def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Tell which pixels have the plain colour and reach the edge through such pixels."""
+    """Tell which pixels have the plain color and reach the edge through such pixels."""
     from scipy import ndimage
 
     parts, count = ndimage.label(plain)
@@ -146,7 +146,7 @@ def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.
     """Return alpha: 0 behind the content, 255 within it, and `UNSURE` where a pixel may have some of the background.
 
     Of pixels along the outline that is a part; holes through the content show nothing else. Both may as well be content
-    of that colour.
+    of that color.
     """
     from scipy import ndimage
 

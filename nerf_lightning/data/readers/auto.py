@@ -63,7 +63,7 @@ class AutoReader(CaptureReader):
     Settings that are left as they are have the values that the format's own reader has.
 
     Args:
-        images: the folder of the photographs below root; null: where the format has it.
+        images: the folder of the photographs below root; null: the format's own.
     """
 
     name: str = "auto"

@@ -41,15 +41,16 @@ class GivenFrameReader(Reader):
     """Read a scene of pictures of one size whose frame is kept, with a near, a far and a box that a person gives.
 
     Args:
-        near: distance along every ray at which content may begin, scene units.
+        near: distance along every ray at which content begins, scene units.
         far: distance at which content ends.
-        background: what lies behind the pictures, or behind their transparent pixels: white, black, random or none.
-            null: white in the Blender format, else black; where a plain background was cut out, white_or_random,
-            black_or_random or random, as its colour is.
-        cut_out: where opaque pictures show a thing before one plain colour, make that transparent.
-        downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal length follows.
-        aabb_half: half the side of the box around the origin that holds the content, scene units.
-        name: what the scene is called in reports.
+        background: the background of the images or of their transparent pixels: white, black, random or none. null:
+            white in the Blender format, otherwise black; if a plain background was cut out, white_or_random,
+            black_or_random or random, depending on its color.
+        cut_out: if opaque images show an object on a plain background, make that transparent.
+        downscale: integer factor by which images are shrunk (area filter on premultiplied colors); the focal length is
+            scaled, too.
+        aabb_half: half the side of the box around the origin that contains the scene, scene units.
+        name: the scene's name in reports.
     """
 
     near: float = 2.0

@@ -44,11 +44,11 @@ class BlenderReader(GivenFrameReader):
     A missing val split is held out from train, every 8th view. A missing test split is judged on val.
 
     Args:
-        root: the folder with the json files.
-        skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; splits not named are
-            taken whole.
-        metres_per_unit: how many metres a scene unit is long, where it is known; null: unknown.
-        allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
+        root: the folder with the JSON files.
+        skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; other splits are taken whole.
+        metres_per_unit: length of a scene unit in meters, if known; null: unknown.
+        allow_outside: follow names and links that lead out of root; false refuses them, because the capture may be
+            untrusted.
     """
 
     named_by = (".json",)
@@ -169,7 +169,7 @@ def _file_of(root: Path, split: str) -> Path | None:
 def _is_photographed(path: Path) -> bool:
     """Tell whether a file lists photographs, as instant-ngp's do, and not renderings of the original format.
 
-    Photographs have a lens, or opaque pictures without one colour at all four corners.
+    Photographs have a lens, or opaque pictures without one color at all four corners.
     """
     file = FrameFile.read(path, FORMAT)
     first = file.frames[0] if file.frames and isinstance(file.frames[0], dict) else {}

@@ -79,9 +79,9 @@ class ColmapReader(CaptureReader):
     """Read a COLMAP model, binary or text, with one camera for all photographs or one for each.
 
     Args:
-        images: the folder of the photographs below root; a shrunk copy such as images_4 will do. null: images, input or
-            another usual one, whose files the model's names fit.
-        model: the folder of the model below root. null: where models usually lie, the one with most photographs.
+        images: the folder of the photographs below root, or of a downscaled copy such as images_4. null: images, input
+            or another common one whose files match the model's names.
+        model: the folder of the model below root. null: of the usual places, the model with the most photographs.
     """
 
     name: str = "colmap"
@@ -267,7 +267,7 @@ def read_model(folder: Path) -> ColmapModel:
     with reading(images_path, CURE):
         images = sorted(files.images(images_path), key=lambda image: image.name)
     if not images:
-        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
+        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learned. {CURE}")
     with reading(points_path, CURE):
         points = files.points(points_path) if points_path.exists() else NO_POINTS
     if points is NO_POINTS and (folder / PLY).is_file():

@@ -253,7 +253,7 @@ def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterat
     for number, line in enumerate(lines):
         if number == most:
             raise InputError(
-                f"{path} has more than {most:,} {budget}, which are not taken from a file unasked. If you trust it, "
+                f"{path} has more than {most:,} {budget}, the limit. If you trust it, "
                 f"add budgets.{budget}=N; else use another file."
             )
         yield line

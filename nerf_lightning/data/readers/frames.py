@@ -73,7 +73,7 @@ class FrameFile:
 
 
 def say_of_files(files: Sequence[FrameFile]) -> None:
-    """Say what of the files of one capture is not used, or not modelled."""
+    """Say what of the files of one capture is not used, or not modeled."""
     first, read = files[0].path, {file.path for file in files}
     beside = sorted(path.name for path in first.parent.glob("transform*_*.json") if path not in read)
     if beside:
@@ -85,7 +85,9 @@ def say_of_files(files: Sequence[FrameFile]) -> None:
         repr(frame["time"]) for file in files for frame in file.frames if isinstance(frame, dict) and "time" in frame
     }
     if len(times) > 1:
-        log.warning("%s: time differs between frames, and the scene is taken as static: what moves blurs", first)
+        log.warning(
+            "%s: time differs between frames, and the scene is taken as static: moving content is blurred", first
+        )
 
 
 @dataclass(frozen=True)
@@ -180,14 +182,14 @@ def number_of(settings: dict[str, Any], key: str, where: str, default: float | N
     try:
         return float(value)
     except OverflowError:
-        raise InputError(f"{where}: {key} has too many digits for a number of a camera. Mend it.") from None
+        raise InputError(f"{where}: {key} has too many digits for a number of a camera. Fix it.") from None
 
 
 def positive_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     """Return a number above 0; `InputError` refuses another, and infinity."""
     value = number_of(settings, key, where, default)
     if not 0 < value < math.inf:
-        raise InputError(f"{where}: {key} is {value:g}, but it must be above 0. Mend it, or remove it.")
+        raise InputError(f"{where}: {key} is {value:g}, but it must be above 0. Fix it, or remove it.")
     return value
 
 

@@ -38,9 +38,9 @@ class LlffReader(CaptureReader):
     """Read an LLFF capture. Rows belong to the photographs in order of their names, sorted as text.
 
     Args:
-        images: the folder of photographs below root; null takes the first of images, image, rgb, input, root itself and
-            the shrunk images_2, images_4 and images_8 that has pictures.
-        order: how names are sorted: as text, as imgs2poses does it, or by the numbers in them.
+        images: the folder of photographs below root; null: the first of images, image, rgb, input, root itself and the
+            downscaled images_2, images_4 and images_8 that has images.
+        order: how names are sorted: as text, like imgs2poses, or by the numbers in them.
     """
 
     name: str = "llff"
@@ -123,7 +123,7 @@ def _registered(root: Path, names: list[str]) -> list[str]:
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
-    """Return a row for each view: a 3 x 5 matrix (down, right, back, centre; height, width, focal) and two depths."""
+    """Return a row for each view: a 3 x 5 matrix (down, right, back, center; height, width, focal) and two depths."""
     if not path.is_file():
         raise InputError(
             f"{path} does not exist; the folder holds {contents(path.parent)}. "

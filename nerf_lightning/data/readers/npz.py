@@ -38,14 +38,14 @@ CURE = f"Remove it, and copy or download it again. {LAYOUT}"
 class NpzReader(GivenFrameReader):
     """Read `images` (n h w 3), `poses` (n 4 4, camera-to-world) and `focal` (pixels) from one file.
 
-    Colours are floating point in 0..1 or uint8. The held-out views are both val and test.
+    Colors are floating point in 0..1 or uint8. The held-out views are both val and test.
 
     Args:
         path: the .npz file.
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
-        train_fraction: with `hold_every` 0, the share of the views, from the first on, to learn from.
-        download: where to get an absent file: `url`, `bytes` and `sha256` (None: only its size is checked).
-        max_gigabytes: how much the file may unpack to; what is small on the disk may be made to fill the memory.
+        train_fraction: with `hold_every` 0, the share of the views, from the first on, used for training.
+        download: where to download a missing file: `url`, `bytes` and `sha256` (None: only its size is checked).
+        max_gigabytes: the maximum unpacked size; a small file can be made to fill the memory.
     """
 
     path: str
@@ -135,7 +135,7 @@ def _load(path: Path, max_gigabytes: float) -> tuple[np.ndarray, np.ndarray, flo
 
 
 def _pixels(images: Shaped[np.ndarray, "n h w 3"], downscale: int, path: Path) -> PixelStore:
-    """Return the pictures as 8-bit colours, round(255 x), opaque."""
+    """Return the pictures as 8-bit colors, round(255 x), opaque."""
     count, height, width, _ = images.shape
     store = empty_store([(width // downscale, height // downscale)] * count)
     rgba = np.full((height, width, 4), 255, dtype=np.uint8)
@@ -144,7 +144,7 @@ def _pixels(images: Shaped[np.ndarray, "n h w 3"], downscale: int, path: Path) -
             # Written so that NaN fails too.
             if not ((image >= 0) & (image <= 1)).all():
                 raise InputError(
-                    f"{path}: images[{view}] has values outside 0..1 or NaN. Divide 0..255 colours by 255, "
+                    f"{path}: images[{view}] has values outside 0..1 or NaN. Divide 0..255 colors by 255, "
                     "or store them as uint8."
                 )
             image = np.rint(image.astype(np.float32) * 255)

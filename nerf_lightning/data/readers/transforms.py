@@ -42,9 +42,9 @@ class TransformsReader(CaptureReader):
     """Read a transforms.json; intrinsics may stand at the top, for all views, or in a frame.
 
     Args:
-        file: the json below root; the paths in it are relative to where it lies. null: transforms.json, or all files
-            transforms_*.json as one capture, whose splits those of train, val and test are.
-        depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
+        file: the JSON file below root; paths in it are relative to its folder. null: transforms.json, or all
+            transforms_*.json as one capture, whose splits are train, val and test.
+        depth_unit: length of one level of the 16-bit depth maps (`depth_file_path`), in the capture's units.
     """
 
     named_by = (".json",)
@@ -128,7 +128,12 @@ class TransformsReader(CaptureReader):
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
-                "%s: of %d files (%s) %d are not there: %s", path, len(wanted), key, len(absent), listed(absent, 3)
+                "%s: of %d files (%s) %d are not there, or no pictures: %s",
+                path,
+                len(wanted),
+                key,
+                len(absent),
+                listed(absent, 3),
             )
         return [None if name is None else files.get(name) for name in names]
 
@@ -173,7 +178,7 @@ def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, 
 
 
 def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[int, ...]] | None:
-    """Return the splits of files called after them; others are learnt from."""
+    """Return the splits of files called after them; others are learned from."""
     splits: dict[str, tuple[int, ...]] = {split: () for split in SPLITS}
     start = 0
     for path, count in zip(paths, counts, strict=True):
@@ -201,7 +206,7 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
     for split in SPLITS:
         names = lists.get(split, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"{path}: {split}_filenames must be a list of file names. Mend it, or remove it.")
+            raise InputError(f"{path}: {split}_filenames must be a list of file names. Fix it, or remove it.")
         lost = [name for name in names if _plain(name) not in numbers and _plain(name) not in listed_at_all]
         if lost:
             log.warning("%s: %s_filenames lists %s, which no frame has; this is passed over", path, split, listed(lost))
@@ -249,14 +254,14 @@ def _undo_of(files: list[FrameFile]) -> Float[Tensor, "4 4"]:
 def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
     """Invert nerfstudio's `applied_transform` and `applied_scale`: results line up with what the poses came from.
 
-    In the file's poses the transform was applied to the camera, and then the scale to its centre.
+    In the file's poses the transform was applied to the camera, and then the scale to its center.
     """
     applied = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in content:
         applied[:3] = pose_from_matrix(content["applied_transform"], f"{where}: applied_transform")
         if not is_rigid(applied[:3] / unit_of(applied)):
             raise InputError(
-                f"{where}: applied_transform must turn, move and scale alike along all axes. Mend it, or remove it."
+                f"{where}: applied_transform must turn, move and scale alike along all axes. Fix it, or remove it."
             )
     applied[:3] *= positive_of(content, "applied_scale", where, 1.0)
     return torch.linalg.inv(applied)

@@ -7,8 +7,10 @@ from typing import Any
 from nerf_lightning.data.sfm.gps import align_to_gps
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
 from nerf_lightning.data.sfm.reconstruction import (
+    WITHOUT_DEPTH,
     NothingFoundError,
     SparseModel,
+    cause_of_nothing,
     in_short,
     reconstruct,
     require_pycolmap,
@@ -28,7 +30,7 @@ def find_cameras(
 ) -> SparseModel:
     """Find the cameras of photographs and write the largest model in COLMAP's binary form.
 
-    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in metres with
+    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in meters with
     z up where GPS tells (`align_to_gps`). Of several attempts, the one that places most photographs counts.
 
     Args:
@@ -49,15 +51,17 @@ def find_cameras(
         if models and (not best or _is_better(models[0], best[0])):
             best = models
         placed = best[0].num_reg_images() if best else 0
-        if placed == len(photographs):
+        cause = "" if best else cause_of_nothing(work, attempt)
+        if placed == len(photographs) or cause == WITHOUT_DEPTH:
             break
         if placed and number + 1 < len(tried):
             log.info("cameras: %d of %d placed; next try: %s", placed, len(photographs), tried[number + 1])
     if not best:
         raise NothingFoundError(
-            f"No camera could be placed: the {len(photographs)} pictures share too few details. Take more photographs "
-            "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
-            "zoom and without mirrors or bare walls filling the picture; then try again."
+            f"No camera could be placed: the {len(photographs)} pictures {cause}. Take more photographs that overlap "
+            "by two thirds, from places some steps apart (do not turn on the spot), sharp, with one zoom and without "
+            "mirrors or bare walls filling the picture; then try again.",
+            cause,
         )
     align_to_gps(require_pycolmap(), best[0], folder)
     best[0].write_binary(make_folder(sparse))

@@ -108,23 +108,22 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
         try:
             model = find_cameras(photographs, images, work, work / "sparse" / "0", settings)
         except NothingFoundError as error:
-            raise InputError(_nothing_in_video(video, photographs)) from error
+            raise InputError(_nothing_in_video(video, photographs, error.cause)) from error
         _publish(work, folder)
     return model, chosen_matching(settings.matching, len(photographs))
 
 
-def _nothing_in_video(video: Path, frames: list[FoundPhotograph]) -> str:
+def _nothing_in_video(video: Path, frames: list[FoundPhotograph], cause: str) -> str:
     some = evenly_spaced_subset(range(len(frames)), FRAMES_JUDGED)
     blurred = sum(is_blurred(read_rgba(frames[number].path)[..., :3]) for number in some)
     if 2 * blurred > len(some):
-        cause = "nearly all of them are blurred, although they are the sharpest that there are"
+        cause = "are nearly all blurred, although they are the sharpest that there are"
         cure = "Film again in more light, in focus, holding still or moving slowly"
     else:
-        cause = "they share too few details"
         cure = "Film again: walk slowly around what matters rather than turning on the spot"
     return (
-        f"video={video}: no camera could be placed for the {len(frames)} frames that were chosen; {cause}. {cure}, "
-        "with one zoom. A smaller every= takes more frames of this video."
+        f"video={video}: no camera could be placed for the {len(frames)} frames that were chosen: they {cause}. "
+        f"{cure}, with one zoom. A smaller every= takes more frames of this video."
     )
 
 

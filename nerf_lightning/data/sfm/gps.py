@@ -15,10 +15,10 @@ from nerf_lightning.data.pixels.formats import decoders
 from nerf_lightning.data.pixels.images import DECODER_ERRORS, open_picture
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Radius of the earth in metres, and by how much it is less at the poles (WGS 84)."""
+"""Radius of the earth in meters, and by how much it is less at the poles (WGS 84)."""
 FEWEST = 4
 OFF = 10.0
-"""Metres by which a receiver may be wrong."""
+"""Meters by which a receiver may be wrong."""
 LEAST_SPREAD = 4.0
 """How much farther the places must lie apart, across their longest line, than they are off."""
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def gps_of(path: Path) -> tuple[float, float, float] | None:
-    """Return latitude and longitude in degrees, and metres above the sea; None where a photograph does not say."""
+    """Return latitude and longitude in degrees, and meters above the sea; None where a photograph does not say."""
     try:
         with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
             said: Mapping[int, Any] = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
@@ -45,7 +45,7 @@ def _degrees(said: Mapping[int, Any], key: int, negative: str) -> float:
 
 
 def in_metres(places: Sequence[tuple[float, float, float]]) -> Float[ndarray, "photographs 3"]:
-    """Return places as metres east, north and up from their middle, on the plane that touches the earth there.
+    """Return places as meters east, north and up from their middle, on the plane that touches the earth there.
 
     >>> in_metres([(0.0, 0.0, 5.0), (0.0, 0.001, 5.0)]).round(1).tolist()
     [[-55.7, 0.0, 0.0], [55.7, 0.0, 0.0]]
@@ -61,7 +61,7 @@ def in_metres(places: Sequence[tuple[float, float, float]]) -> Float[ndarray, "p
 
 
 def align_to_gps(colmap: Any, model: Any, folder: Path) -> bool:
-    """Bring a COLMAP model into metres, x to the east and z up, where its photographs say well enough where they were.
+    """Bring a COLMAP model into meters, x to the east and z up, where its photographs say well enough where they were.
 
     The places must fit the model, and lie apart in two directions by several times what they are off: a table that
     was photographed from all sides is smaller than a receiver's error.
@@ -93,7 +93,7 @@ def align_to_gps(colmap: Any, model: Any, folder: Path) -> bool:
         return False
     model.transform(found)
     log.info(
-        "cameras: placed by the GPS of %d photographs, to %.1f m: units are metres, z is up (scene.metres_per_unit=1)",
+        "cameras: placed by the GPS of %d photographs, to %.1f m: units are meters, z is up (scene.metres_per_unit=1)",
         *(len(places), np.median(off)),
     )
     return True

@@ -1,4 +1,4 @@
-"""Films in HDR, as phones take them: recognised, and the frames that are kept tone-mapped to SDR by ffmpeg."""
+"""Films in HDR, as phones take them: recognized, and the frames that are kept tone-mapped to SDR by ffmpeg."""
 
 import logging
 import re
@@ -17,7 +17,7 @@ TO_SDR = (
     "format=gbrp,setparams=color_primaries=bt2020:color_trc={transfer}:colorspace=gbr:range=pc,format=gbrpf32le,"
     "zscale=transfer=linear:npl=203,zscale=primaries=bt709,tonemap=mobius:param=0.7:desat=0,zscale=transfer=bt709"
 )
-"""White is where BT.2408 puts it, at 203 nits; up to 0.7 of it colours are kept, above they are compressed."""
+"""White is where BT.2408 puts it, at 203 nits; up to 0.7 of it colors are kept, above they are compressed."""
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def hdr_transfer(video: Path, input_params: Sequence[str]) -> str | None:
         return None
     if not set(_run_ffmpeg("-filters").decode().split()) >= FILTERS:
         log.warning(
-            "%s is filmed in HDR (%s), and this ffmpeg has no zscale to tone-map it: colours will look flat. Film "
+            "%s is filmed in HDR (%s), and this ffmpeg has no zscale to tone-map it: colors will look flat. Film "
             "without HDR, or convert the film to SDR first.",
             *(video, found[0]),
         )

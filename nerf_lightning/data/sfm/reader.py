@@ -29,10 +29,10 @@ class PhotosReader(AutoReader):
     """Read photographs whose cameras nobody knows yet; a folder of a known format is read as what it is.
 
     Args:
-        root: the folder of the photographs; they lie in it, or in `images` below it.
-        video: a video, in place of root.
-        panoramas: whether the pictures are equirectangular panoramas of all directions; auto: where they say so, or
-            all are exactly twice as wide as high.
+        root: the folder of the photographs, or the parent of a folder `images`.
+        video: a video instead of root.
+        panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
+            as wide as high.
     """
 
     root: str | None = None  # type: ignore[assignment]
@@ -55,7 +55,7 @@ class PhotosReader(AutoReader):
         if self.root is not None and self.known_format(self.folder()) is not None:
             return super().reader()
         found = ranks.from_first(self._cameras)
-        log.info("cameras: kept in %s (scene.cache_dir=DIR keeps them elsewhere)", found)
+        log.info("cameras: cached in %s (scene.cache_dir=DIR changes the folder)", found)
         return ColmapReader(**self._chosen() | {"root": str(found), "name": self.name})
 
     def _cameras(self) -> Path:
@@ -67,13 +67,13 @@ class PhotosReader(AutoReader):
             return folder
         require_pycolmap()
         make_own_folder(cache)
-        log.info("cameras: nobody knows them yet, so they are found first (nerf poses does this alone, with settings)")
+        log.info("cameras: unknown, so they are found first (nerf poses does only this, with more settings)")
         if self.video is not None:
             model, matching = from_video(source, None, folder, settings)
         else:
             model, matching = from_photographs(source, folder, settings)
         found, total = len(model.registered), len(model.registered) + len(model.left_out)
-        log.info("cameras: found those of %d of %d, to %.2f pixels", found, total, model.reprojection_error)
+        log.info("cameras: found %d of %d, with an error of %.2f pixels", found, total, model.reprojection_error)
         for remark in remarks(model, matching, self.video is not None):
             log.warning("cameras: %s", remark)
         return folder

@@ -32,7 +32,11 @@ Report = Callable[[str, float], None]
 
 
 class NothingFoundError(InputError):
-    """Photographs none of whose cameras could be placed."""
+    """Photographs none of whose cameras could be placed; `cause` completes "the pictures ..."."""
+
+    def __init__(self, message: str, cause: str):
+        super().__init__(message)
+        self.cause = cause
 
 
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
@@ -41,6 +45,8 @@ FEWEST_POINTS = 30
 """That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
+WITHOUT_DEPTH = "show the same details without depth, all from one place or of one flat thing"
+"""Why nothing was found, where more than half of the compared pairs say so."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,16 @@ def in_short(models: list[Any], names: list[str]) -> SparseModel:
         num_cameras=model.num_cameras(),
         reprojection_error=model.compute_mean_reprojection_error(),
     )
+
+
+def cause_of_nothing(work: Path, attempt: Attempt) -> str:
+    """Return why an attempt has placed no camera: "the pictures ..."."""
+    colmap = require_pycolmap()
+    kinds = colmap.TwoViewGeometryConfiguration
+    with _opened(colmap, work / attempt.database) as content:
+        _, pairs = content.read_two_view_geometries()
+    flat = [pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC) for pair in pairs]
+    return WITHOUT_DEPTH if 2 * sum(flat) > len(pairs) else "share too few details"
 
 
 @contextmanager

@@ -27,11 +27,11 @@ class SfmSettings:
     """How structure from motion is done.
 
     Args:
-        matching: which photographs are compared: all pairs, neighbours in the order of names, or by their number.
+        matching: which photographs are compared: all pairs, neighbors in the order of names, or by their number.
         camera_mode: one camera for all, one each, or one per size and EXIF focal length.
         camera_model: COLMAP's name of the lens model; panoramas have one of their own.
-        panoramas: whether the pictures are equirectangular panoramas of all directions; auto: where they say so, or
-            all are exactly twice as wide as high.
+        panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
+            as wide as high.
         num_features: most features of a photograph; auto: 8192, of more than 24 photographs 3072, of more than 80 2048,
             and other ways where photographs are left out (`attempts`).
         max_image_size: the longer side in pixels to which photographs are shrunk for finding features.

@@ -30,7 +30,7 @@ logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Return the variance of the Laplacian of a small grey version: the higher, the sharper.
+    """Return the variance of the Laplacian of a small gray version: the higher, the sharper.
 
     The measure of Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000. It compares frames
     of one scene; a blank wall is never sharp. The frame is first averaged down to at most 480 pixels or so on its
@@ -43,7 +43,7 @@ def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
 
 
 def is_blurred(frame: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Tell whether a frame has no details as fine as its pixels could show, in a small grey version.
+    """Tell whether a frame has no details as fine as its pixels could show, in a small gray version.
 
     What is sharp loses most of its fine details in a blur of one pixel; what was blurred before has none to lose
     (after Crete et al., "The blur effect", 2007). A blank frame counts as blurred.

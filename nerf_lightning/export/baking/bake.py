@@ -1,4 +1,4 @@
-"""From a model to bytes in blocks: densities, who sees them, and their colours."""
+"""From a model to bytes in blocks: densities, who sees them, and their colors."""
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ SHARE_LEFT_OUT = 0.035
 # Rays through the training views that are followed, at most: every other pixel tells as much.
 FOLLOWED_RAYS = 1_000_000
 CLOSED = 0.98  # A scene that stops so much of their light is one that none comes from behind of.
-# Values at which all but so much of it is stopped are kept, and their neighbours: where the scene is closed, and where
+# Values at which all but so much of it is stopped are kept, and their neighbors: where the scene is closed, and where
 # what is left out would let the background through.
 LEFT_OUT_OF_CLOSED, LEFT_OUT = 0.01, 0.002
 
@@ -56,7 +56,7 @@ def bake(
 
 
 def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:
-    """Return which voxels stop light that some camera would see, but for the faintest, and their neighbours."""
+    """Return which voxels stop light that some camera would see, but for the faintest, and their neighbors."""
     stopped = around.light.max(axis=1) * -np.expm1(-grid.optical[tuple(around.voxels.T)])
     order = np.argsort(stopped)
     together = np.cumsum(stopped[order])

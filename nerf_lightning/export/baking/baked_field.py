@@ -22,11 +22,11 @@ LEVEL = 6  # Of gzip; higher ones take many times as long, for one part in a hun
 
 @dataclass(frozen=True)
 class BakedField:
-    """Density and colour at the corners of a lattice, in blocks of 8 x 8 x 8 values.
+    """Density and color at the corners of a lattice, in blocks of 8 x 8 x 8 values.
 
     A byte q of density is an optical depth of 2^(a + b q) - 2^a along a way as long as a voxel (its longest side): a
     step of any length has its own opacity.
-    Colour is a sum of real spherical harmonics of the viewing direction; bytes of the first are its colour, bytes of
+    Color is a sum of real spherical harmonics of the viewing direction; bytes of the first are its color, bytes of
     the others go from -range to range, with nothing at 128.
     """
 
@@ -40,9 +40,9 @@ class BakedField:
     """Which blocks there are: x * (ny * nz) + y * nz + z, rising."""
     density: UInt8[ndarray, "blocks 8 8 8"]
     colored: Bool[ndarray, "blocks 8 8 8"]
-    """Which values have a colour: those that can be seen."""
+    """Which values have a color: those that can be seen."""
     colors: UInt8[ndarray, "channels colored"]
-    """Three channels for each spherical harmonic; the coloured values in their order."""
+    """Three channels for each spherical harmonic; the colored values in their order."""
     ranges: tuple[float, float]
     """Half range of the coefficients of degree 1 and 2."""
     contraction: Contraction | None = None
@@ -52,7 +52,7 @@ class BakedField:
 
     @property
     def num_harmonics(self) -> int:
-        """How many spherical harmonics a colour has: 1, 4 or 9."""
+        """How many spherical harmonics a color has: 1, 4 or 9."""
         return len(self.colors) // 3
 
     @property
@@ -68,7 +68,7 @@ class BakedField:
         return index.reshape(self.shape)
 
     def channel(self, number: int) -> UInt8[ndarray, "blocks 8 8 8"]:
-        """Return a channel of all values; those without a colour are black, and the same from all sides."""
+        """Return a channel of all values; those without a color are black, and the same from all sides."""
         values = np.full(self.colored.shape, 0 if number < 3 else NO_CHANGE, np.uint8)
         values[self.colored] = self.colors[number]
         return values
@@ -124,7 +124,7 @@ def described(baked: BakedField) -> dict[str, Any]:
 
 
 def serialized(baked: BakedField) -> bytes:
-    """Return the bytes, compressed: blocks' numbers, densities, which values are coloured (bits), then each channel."""
+    """Return the bytes, compressed: blocks' numbers, densities, which values are colored (bits), then each channel."""
     parts = (
         baked.blocks.astype("<i4"),
         baked.density,

@@ -31,7 +31,7 @@ class Cost:
     """PSNR against the photographs (dB); None: there are none."""
     model: float | None = None
     num_densities: float = 0.0
-    """Samples of density per pixel and frame, and those of colour among them."""
+    """Samples of density per pixel and frame, and those of color among them."""
     num_colors: float = 0.0
 
     def facts(self) -> list[tuple[str, str]]:
@@ -43,7 +43,7 @@ class Cost:
         if self.page is not None and self.model is not None:
             cost = f"{self.page:.2f} dB against the photographs of {views}, the model {self.model:.2f} dB"
             found = [("PSNR", cost), *found]
-        samples = f"{self.num_densities:.1f} of density and {self.num_colors:.1f} of colour per pixel and frame"
+        samples = f"{self.num_densities:.1f} of density and {self.num_colors:.1f} of color per pixel and frame"
         return [*found, ("samples", samples)]
 
 
@@ -86,6 +86,6 @@ def measured_cost(
 
 
 def over(marched: MarchedRays, background: Background) -> Float[Tensor, "*rays 3"]:
-    """Return the colours over a background; where a scene has none, over black."""
+    """Return the colors over a background; where a scene has none, over black."""
     behind = background_colors(background, 1, torch.device("cpu"), random=None)
     return marched.rgb if behind is None else marched.rgb + (1.0 - marched.opacity)[..., None] * behind

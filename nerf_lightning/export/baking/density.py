@@ -21,7 +21,7 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 FIRST = 96  # Cells along the longest side of the first look.
 STRIDE = 4  # The second look is at every fourth voxel.
-DEEPEST = 4.0  # Of voxels in normalised device coordinates, in sides of a pixel.
+DEEPEST = 4.0  # Of voxels in normalized device coordinates, in sides of a pixel.
 LEAST_OPTICAL = 0.01  # A voxel that stops less of the light holds nothing.
 # The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
 BYTES_PER_VOXEL = 20
@@ -92,7 +92,7 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
 
 
 def depths_of_voxels(record: SceneRecord) -> Float[Tensor, "3"]:
-    """Return the sides of a voxel in normalised device coordinates, those of a pixel being 1.
+    """Return the sides of a voxel in normalized device coordinates, those of a pixel being 1.
 
     One is as deep as it takes for the photographs from either end to show it at a place that is off by one pixel from
     where those from the middle do. In these coordinates a place z moves by (1 - z) / 2 times the camera's way times a,
@@ -151,6 +151,6 @@ def _asked(
 
 
 def dilated(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
-    """Return the mask with all neighbours, those across edges and corners among them."""
+    """Return the mask with all neighbors, those across edges and corners among them."""
     grown: Bool[ndarray, "x y z"] = binary_dilation(mask, np.ones((3, 3, 3), bool))
     return grown

@@ -1,6 +1,6 @@
-"""A baked field's bytes, fitted to the photographs that the model learnt from.
+"""A baked field's bytes, fitted to the photographs that the model learned from.
 
-What mixing between voxels, few spherical harmonics and fog that was left out have cost is learnt back: PlenOctrees
+What mixing between voxels, few spherical harmonics and fog that was left out have cost is learned back: PlenOctrees
 (arXiv 2103.14024, Sec. 3.4) tune what they have baked in the same way.
 """
 
@@ -36,7 +36,7 @@ def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, rep
 
     Each step marches some rays through the bytes as they are (`Marcher`: what is shown is what is fitted), and moves
     numbers, of which the bytes are the nearest, against the gradient (straight-through, arXiv 1308.3432). Which
-    voxels have a colour stays as it was, and so do the densities of all others. The photographs are in the frame of
+    voxels have a color stays as it was, and so do the densities of all others. The photographs are in the frame of
     the model; to those that it was not trained on, by its record, nothing is fitted.
     """
     known = {record.view_names[view] for view in record.splits["train"]}
@@ -59,7 +59,7 @@ def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, rep
 
 
 class _Values:
-    """Numbers of which a field's bytes are the nearest: a row for each coloured value, its density and its colours."""
+    """Numbers of which a field's bytes are the nearest: a row for each colored value, its density and its colors."""
 
     def __init__(self, baked: BakedField):
         self.baked, self.marcher = baked, Marcher(baked)

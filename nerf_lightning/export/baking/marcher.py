@@ -27,7 +27,7 @@ class MarchedRays:
     depth: Float[Tensor, "*rays"]
     """Distance at which the stopped light was stopped, scene units; 0 where none was."""
     num_densities: float
-    """Samples of density per ray, and of colour, on average."""
+    """Samples of density per ray, and of color, on average."""
     num_colors: float
 
 

@@ -1,4 +1,4 @@
-"""The colours of voxels as spherical harmonics, fitted to what the field says in the directions they are seen from."""
+"""The colors of voxels as spherical harmonics, fitted to what the field says in the directions they are seen from."""
 
 import math
 from dataclasses import dataclass, replace
@@ -30,8 +30,8 @@ RANGES = (0.6, 0.6)  # Half range of the bytes of coefficients, of degree 1 and 
 # Their bytes are multiples of this: such small changes are not seen, and few different bytes are packed well.
 COARSE = 8
 MARGIN = 0.02  # The part of a view's cone that a grid of pixels over it may miss.
-SHARPER = 0.5  # How much more colours differ from their neighbours' than the field's.
-LEAST_DISPARITY = 1e-3  # In normalised device coordinates, from the far end.
+SHARPER = 0.5  # How much more colors differ from their neighbors' than the field's.
+LEAST_DISPARITY = 1e-3  # In normalized device coordinates, from the far end.
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class SeenVoxels:
 def who_sees(
     grid: DensityGrid, voxels: Int[ndarray, "voxels 3"], record: SceneRecord, num_harmonics: int, report: Report
 ) -> SeenVoxels:
-    """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
+    """Ask which cameras see what is dense, and the air next to it, whose colors are mixed in."""
     world = _in_world(grid.places(voxels), record)
     eyes, views = _camera_views(record)
     contraction, spacing = grid.contraction, grid.spacing.numpy()
@@ -75,8 +75,8 @@ def who_sees(
 def _camera_views(record: SceneRecord) -> tuple[Float[ndarray, "cameras 4"], Float[ndarray, "cameras 7"]]:
     """Return where the training cameras are in the field's space, homogeneous, and their cones in the world.
 
-    A cone is a centre, an axis and the cosine of the widest angle. The way from a place p to a camera is xyz - w p:
-    normalised device coordinates keep straight lines, and may put a camera beyond infinity.
+    A cone is a center, an axis and the cosine of the widest angle. The way from a place p to a camera is xyz - w p:
+    normalized device coordinates keep straight lines, and may put a camera beyond infinity.
     """
     train = list(record.splits["train"])
     cameras, none = record.cameras, torch.zeros(len(record.near))
@@ -109,7 +109,7 @@ def fitted_colors(
     tile_points: int,
     report: Report,
 ) -> Float[Tensor, "voxels harmonics 3"]:
-    """Return the coefficients (1, 4 or 9) that fit the last level's colours best, weighted by the light that arrives.
+    """Return the coefficients (1, 4 or 9) that fit the last level's colors best, weighted by the light that arrives.
 
     min_c sum_k w_k |Y(d_k) c - rgb(d_k)|^2 + ridge |c_{l > 0}|^2 sum_k w_k, for each voxel and channel; then
     `sharpened`.
@@ -141,7 +141,7 @@ def fitted_colors(
 def sharpened(
     fitted: Float[Tensor, "voxels harmonics 3"], voxels: Int[ndarray, "voxels 3"], shape: tuple[int, ...]
 ) -> Float[Tensor, "voxels harmonics 3"]:
-    """Return coefficients of voxels in a grid that differ more from those of their six neighbours.
+    """Return coefficients of voxels in a grid that differ more from those of their six neighbors.
 
     Mixing between voxels makes them differ less.
     """
@@ -161,7 +161,7 @@ def sharpened(
 
 
 def to_bytes_of_colors(fitted: Float[Tensor, "voxels harmonics 3"]) -> UInt8[Tensor, "voxels channels"]:
-    """Return bytes, channel by channel: the first as the colour that it is, the others within their ranges."""
+    """Return bytes, channel by channel: the first as the color that it is, the others within their ranges."""
     base = (fitted[:, :1] * DEGREE_1).clamp(0, 1) * 255.0
     ranges = torch.tensor([RANGES[0]] * 3 + [RANGES[1]] * 5)[: fitted.shape[1] - 1, None]
     others = in_coarse_steps(fitted[:, 1:] / ranges * 127.0 + NO_CHANGE)

@@ -38,7 +38,7 @@ def seeing_cameras(
         voxels: the numbers of those that are asked about.
         places: where they lie in the world.
         eyes: where the cameras are in the grid, homogeneous: the way there from p is xyz - w p.
-        views: a camera's centre and unit axis in the world, and the cosine of the widest angle that it sees.
+        views: a camera's center and unit axis in the world, and the cosine of the widest angle that it sees.
         sides: of a voxel; optical depths are those of a way of 1.
         most: cameras for each voxel.
         tries: so many are asked, other ones for each voxel.
@@ -56,7 +56,7 @@ def _seeing(first, last, optical, filled, voxels, places, eyes, views, sides, tr
     count, most = eyes.shape[0], cameras.shape[1]
     for voxel in range(first, last):
         found = 0
-        # Neighbours begin with different cameras; the step is prime, so that all have their turn.
+        # Neighbors begin with different cameras; the step is prime, so that all have their turn.
         start = (voxels[voxel, 0] * 73 + voxels[voxel, 1] * 179 + voxels[voxel, 2] * 283) % count
         for turn in range(min(tries, count)):
             camera = (start + turn * 7919) % count
@@ -130,7 +130,7 @@ def march_tiles(
     step: float,
     lengths: Float[ndarray, "rays"],
 ) -> Float[ndarray, "rays 7"]:
-    """Return colour (3), opacity, and expected distance of the stopped light times it; samples of density, of colour.
+    """Return color (3), opacity, and expected distance of the stopped light times it; samples of density, of color.
 
     Args:
         origins: in voxels.
@@ -211,7 +211,7 @@ def note(sample, tile, x, y, z, weight, alpha, t, rate):
 @njit
 @no_type_check
 def look_at(samples, look, colors, scale, result):
-    """Add up the colours, opacity and distance of a ray's samples."""
+    """Add up the colors, opacity and distance of a ray's samples."""
     rgb, mixed = np.empty(3, np.float32), np.empty(colors.shape[-1], np.float32)
     for sample in samples:
         weight = sample[4]
@@ -245,7 +245,7 @@ def _between(tile, x, y, z):
 @njit
 @no_type_check
 def color_at(tile, x, y, z, look, scale, mixed, rgb):
-    """Mix the bytes of the eight values around a place, and find their colour; it may lie beyond 0 to 1."""
+    """Mix the bytes of the eight values around a place, and find their color; it may lie beyond 0 to 1."""
     (i, u), (j, v), (k, w) = _corner(x), _corner(y), _corner(z)
     mixed[:] = np.float32(0.0)
     for corner in range(8):

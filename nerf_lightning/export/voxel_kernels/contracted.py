@@ -69,7 +69,7 @@ def _seeing(first, last, optical, filled, voxels, places, units, eyes, views, ne
     count, most = eyes.shape[0], cameras.shape[1]
     for voxel in range(first, last):
         found = 0
-        # As in `bounded`: neighbours begin with different cameras.
+        # As in `bounded`: neighbors begin with different cameras.
         start = (voxels[voxel, 0] * 73 + voxels[voxel, 1] * 179 + voxels[voxel, 2] * 283) % count
         for turn in range(min(tries, count)):
             camera = (start + turn * 7919) % count
@@ -137,7 +137,7 @@ def stopped_light(
 
 
 def _with_border(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
-    # A place whose upper neighbours hold something does so too.
+    # A place whose upper neighbors hold something does so too.
     grown = mask.copy()
     for axis in range(3):
         np.moveaxis(grown, axis, 0)[:-1] |= np.moveaxis(grown.copy(), axis, 0)[1:]

@@ -22,7 +22,7 @@ def gradients(
 
     Args:
         blocks: the field.
-        wanted: rays and their colours.
+        wanted: rays and their colors.
         least_met: what rays miss is as what they meet if they meet so much at least; 0: it is the background.
         gradient: of one half of the rays, and of the other: always two, so that sums do not depend on threads.
 
@@ -76,7 +76,7 @@ def _gradients(
 @njit
 @no_type_check
 def _error(samples, rgb, wanted, behind, least_met, error):
-    # The derivatives by the sums of weights times colours, and of weights; half of whose squares' sum is what counts.
+    # The derivatives by the sums of weights times colors, and of weights; half of whose squares' sum is what counts.
     error[:] = ZERO
     opacity, by_opacity = ZERO, ZERO
     for n in range(len(samples)):
@@ -101,12 +101,12 @@ def _error(samples, rgb, wanted, behind, least_met, error):
 @njit
 @no_type_check
 def _steepness(rgb, weight, error, look, scale, steepness):
-    # The derivatives by the bytes of colour; returned is that by the weight.
+    # The derivatives by the bytes of color; returned is that by the weight.
     gain = ZERO
     for channel in range(3):
         value, slope = rgb[channel], weight * error[channel]
         gain += error[channel] * min(max(value, ZERO), ONE)
-        # A colour beyond what can be shown may come back.
+        # A color beyond what can be shown may come back.
         if (value < ZERO and slope > ZERO) or (value > ONE and slope < ZERO):
             slope = ZERO
         steepness[1 + channel] = slope / np.float32(255.0)

@@ -43,7 +43,7 @@ class Wanted:
     """As `bounded.march_tiles` takes them; outside, the distance at which each begins."""
     rgb: Float[ndarray, "rays 3"]
     behind: Float[ndarray, "rays 3"]
-    """The colours of the background."""
+    """The colors of the background."""
 
 
 def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.", room: str = ROOM) -> ModuleType:

@@ -24,7 +24,7 @@ def compared_kernels(device: torch.device) -> dict[str, dict[str, Callable[[], N
 
 
 def points_along_rays(device: torch.device) -> Tensor:
-    """Return points of the unit cube as rays meet them: neighbours lie close together."""
+    """Return points of the unit cube as rays meet them: neighbors lie close together."""
     start = torch.rand(POINTS // RAY_SAMPLES, 1, 3)
     along = 0.003 * torch.nn.functional.normalize(torch.randn_like(start), dim=-1)
     points = start + along * torch.arange(RAY_SAMPLES)[:, None]

@@ -113,7 +113,7 @@ def seen_faces(
     tile_points: int,
     report: Report,
 ) -> Int[ndarray, "seen 3"]:
-    """Return the faces that a training view sees, or whose neighbours it does, of which there must be some."""
+    """Return the faces that a training view sees, or whose neighbors it does, of which there must be some."""
     cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
     points = torch.from_numpy(vertices).float()
     seen = torch.zeros(len(points), dtype=torch.bool)

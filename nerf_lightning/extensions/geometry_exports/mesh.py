@@ -1,4 +1,4 @@
-"""A mesh of the surface: of the density or of what the views see, cleaned, coloured, in the user's frame."""
+"""A mesh of the surface: of the density or of what the views see, cleaned, colored, in the user's frame."""
 
 import logging
 from dataclasses import dataclass
@@ -52,26 +52,26 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MeshExport(Export):
-    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a colour per vertex or a texture.
+    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a color per vertex or a texture.
 
     Args:
         resolution: cells along the longest side of the box.
-        surface: `density` is where the density crosses the threshold, also where nobody looks; `tsdf` fuses the
-            rendered depth of the training views, which is nearer to what they see, and open where none looks.
-        threshold: with `density`: per scene unit, at the surface; None: where rendering sees it (`surface_level`).
-        truncation: with `tsdf`: how far before and behind a surface views are asked for their distance, in cells. More
-            is smoother, less keeps thin things.
-        colors: colour of a vertex, as seen from the nearest cameras, or along the surface's normal.
-        min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
-        seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
-        faces: most faces, reached by decimation; None keeps all, or 60,000 where there is a texture.
-        texture: colours are a picture, each texel as the views see it that look at it best; then `colors` says nothing.
+        surface: `density` extracts the surface where the density crosses the threshold; `tsdf` fuses the rendered
+            depth of the training views, which is closer to the true surface, and open where no view looks.
+        threshold: with `density`: the density at the surface, per scene unit; None: where rendering sees it
+            (`surface_level`).
+        truncation: with `tsdf`: the distance in front of and behind a surface within which views are averaged, in
+            cells. More is smoother, less keeps thin parts.
+        colors: the color of a vertex: as seen from the nearest cameras, or along the surface's normal.
+        min_share: connected parts with fewer faces than this share of the largest one are removed as floaters.
+        seen_only: remove what no training view sees, mainly interior surfaces; otherwise the mesh is closed.
+        faces: maximum number of faces, by decimation; None: all, or 60,000 with a texture.
+        texture: write a texture, with each texel from the views that face it most directly; `colors` is then ignored.
             Needs `pip install 'nerf-lightning[texture]'`.
-        texture_size: texels along each side of the picture.
-        format: of the file; PLY and OBJ open everywhere, in the capture's frame; GLB is one file for browsers, and its
-            root node turns it so that y is up, and gives it its size in metres where the capture's unit is known, as
-            glTF has it. None: PLY, or GLB where there is a texture, which PLY does not know; OBJ then has an MTL and a
-            PNG beside it.
+        texture_size: texels along each side of the texture.
+        format: the file format. PLY and OBJ use the capture's frame; GLB is one file for browsers, whose root node
+            makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. None: PLY, or GLB with a
+            texture; a textured OBJ comes with an MTL and a PNG.
     """
 
     kernels = (f"{__package__}.tsdf_fusion", f"{__package__}.texels")

@@ -1,4 +1,4 @@
-"""Mesh files: PLY, OBJ and GLB, with a normal and a colour for each vertex or with a texture, by optional libraries."""
+"""Mesh files: PLY, OBJ and GLB, with a normal and a color for each vertex or with a texture, by optional libraries."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points 
 
 @dataclass(frozen=True)
 class GltfFrame:
-    """How vertices become glTF's, where y is up and a unit is a metre: the root node turns and scales their frame.
+    """How vertices become glTF's, where y is up and a unit is a meter: the root node turns and scales their frame.
 
     PLY and OBJ say nothing of up and of units, and keep the frame.
     """
@@ -33,7 +33,7 @@ class GltfFrame:
     """How long a unit of that frame is; where nobody knows, 1."""
 
     def __call__(self, tree: dict[str, Any]) -> None:
-        """Place the root node, and let no viewer add light of its own: it is in the colours already."""
+        """Place the root node, and let no viewer add light of its own: it is in the colors already."""
         (root,) = tree["scenes"][tree["scene"]]["nodes"]
         placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(torch.from_numpy(self.up)).numpy()
         tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
@@ -52,10 +52,10 @@ def save_mesh(
     frame: GltfFrame,
     colors: UInt8[ndarray, "vertices 3"],
 ) -> list[Path]:
-    """Write a mesh with an sRGB colour per vertex, whole or not at all; the ending says in which format."""
+    """Write a mesh with an sRGB color per vertex, whole or not at all; the ending says in which format."""
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
-    if form == "glb":  # glTF takes the bytes of vertices' colours for linear light
+    if form == "glb":  # glTF takes the bytes of vertices' colors for linear light
         colors = np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
     settings: dict[str, dict[str, Any]] = {
@@ -89,7 +89,7 @@ def save_textured_mesh(
     if form == "glb":
         material = visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     else:
-        # Full ambient and diffuse light and no highlights: the light is in the colours already.
+        # Full ambient and diffuse light and no highlights: the light is in the colors already.
         material = visual.material.SimpleMaterial(image, ambient=[1.0] * 3, diffuse=[1.0] * 3, specular=[0.0] * 3)
         material.name = path.stem
     textured = visual.TextureVisuals(uv=uv, material=material)

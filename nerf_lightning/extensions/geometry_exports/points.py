@@ -1,4 +1,4 @@
-"""A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
+"""A colored point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
 
 import logging
 import math
@@ -44,13 +44,13 @@ class PointsExport(Export):
     Points that other views do not confirm are left out.
 
     Args:
-        num_points: most points; of more, some are drawn.
-        max_views: most training views that are rendered.
-        longest: pixels of the longer side of what is rendered, at most.
-        min_opacity: share of the light that a pixel must stop.
-        agreement: how many of the nearest 8 other views must see the same surface.
-        tolerance: share of the distance by which their depths may differ.
-        format: of the file; PLY has normals; LAS (1.2, point format 2) is what programs for surveys read, has none, and
+        num_points: maximum number of points, which are drawn at random if there are more.
+        max_views: maximum number of training views to render.
+        longest: maximum length of the longer side of renders, in pixels.
+        min_opacity: minimum opacity of a pixel.
+        agreement: how many of the 8 nearest views must see the same surface.
+        tolerance: maximum relative difference of their depths.
+        format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without, which
             needs `pip install 'nerf-lightning[las]'`.
     """
 
@@ -176,11 +176,11 @@ def save_points(
 
 MOST_STEPS = 1e9  # LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
 FINEST = 1e-30  # What a cloud of one place at zero gets.
-COLOR_SCALE = 257  # Colours have 16 bits there, full scale: 255 becomes 65535.
+COLOR_SCALE = 257  # Colors have 16 bits there, full scale: 255 becomes 65535.
 
 
 def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarray, "points 3"]) -> None:
-    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colours, no normals), whole or not at all."""
+    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colors, no normals), whole or not at all."""
     laspy = require_library("laspy", "las")
     header = laspy.LasHeader(version="1.2", point_format=2)
     header.generating_software = "nerf-lightning"

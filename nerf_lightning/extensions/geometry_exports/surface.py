@@ -1,4 +1,4 @@
-"""Which density counts as the surface, and which colour its points have, looked at from the photographs' cameras."""
+"""Which density counts as the surface, and which color its points have, looked at from the photographs' cameras."""
 
 from typing import Literal
 
@@ -75,10 +75,10 @@ def surface_colors(
     tile_points: int,
     report: Report,
 ) -> UInt8[Tensor, "points 3"]:
-    """Return the colour of each point on the surface, in the scene's frame, as the last level has it.
+    """Return the color of each point on the surface, in the scene's frame, as the last level has it.
 
     A ray of twice `reach` (scene units) passes each. `normal` looks straight at the surface, against its unit outward
-    normal; `cameras` from the training cameras that face it most squarely, and so along directions that were learnt.
+    normal; `cameras` from the training cameras that face it most squarely, and so along directions that were learned.
     """
     device = next(model.parameters()).device
     eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]

@@ -11,7 +11,7 @@ from numpy import ndarray
 def covered_texels(
     corners: Float[ndarray, "faces 3 2"], size: int
 ) -> tuple[Int[ndarray, "size size"], Float[ndarray, "size size 3"]]:
-    """Return the number of the face that covers each texel's centre (-1: none), and the shares of its corners there.
+    """Return the number of the face that covers each texel's center (-1: none), and the shares of its corners there.
 
     `corners` are x to the right and y down, in texels from the upper left corner of the picture.
     """

@@ -1,4 +1,4 @@
-"""A texture for a mesh: charts that lie flat in one square picture, and the colours that views have of each texel."""
+"""A texture for a mesh: charts that lie flat in one square picture, and the colors that views have of each texel."""
 
 from dataclasses import dataclass
 
@@ -27,13 +27,13 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-PADDING = 4  # Texels between charts, so that none shines into another where a viewer mixes neighbours.
-# Training views that are asked which places they see, and how many of them give a texel its colour.
+PADDING = 4  # Texels between charts, so that none shines into another where a viewer mixes neighbors.
+# Training views that are asked which places they see, and how many of them give a texel its color.
 VIEWS, LOOKS = 100, 3
 LEAST_COSINE = 0.1  # Views that see a surface less squarely (cosine) are not asked.
-LEAST_SEEN = 1e-3  # A texel of which less is seen has no colour of its own: that of the nearest one that has.
+LEAST_SEEN = 1e-3  # A texel of which less is seen has no color of its own: that of the nearest one that has.
 LEAST_SIZE, LARGEST_SIZE = 16, 16_384
-# Which face and where on it, its colour, and the nearest that has one: measured, where charts fill the picture.
+# Which face and where on it, its color, and the nearest that has one: measured, where charts fill the picture.
 BYTES_PER_TEXEL = 100
 # Rays of texels begin before the surface by so many times the reach, and have so many samples: nearer, what is hazy
 # after a short training is painted too light; farther costs more and gains nothing that is seen.
@@ -76,8 +76,8 @@ def make_atlas(vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "face
 
 
 def find_texels(atlas: Atlas, size: int) -> Texels:
-    """Return the texels whose centres the charts cover."""
-    cure = "Reinstall numba, or leave what.texture=true out for a colour per vertex."
+    """Return the texels whose centers the charts cover."""
+    cure = "Reinstall numba, or leave what.texture=true out for a color per vertex."
     texels = kernels("texels", "what.texture=true", cure, __package__)
     down = np.stack([atlas.uv[:, 0], 1.0 - atlas.uv[:, 1]], axis=1) * size
     face, shares = texels.covered_texels(down[atlas.faces], size)
@@ -100,7 +100,7 @@ def require_texture_room(size: int) -> None:
 class TextureMaker:
     """Look at the places of a mesh from the training cameras that see them best.
 
-    How well a camera sees a vertex is told by a whole ray; the colour of a texel then by a short one, through the
+    How well a camera sees a vertex is told by a whole ray; the color of a texel then by a short one, through the
     surface: what lies farther before it need not be asked about again. Vertices and their unit outward normals are in
     the scene's frame; `reach` is how far the mesh may be from the surface that the views see, scene units.
     """
@@ -117,7 +117,7 @@ class TextureMaker:
         self.device = next(self.model.parameters()).device
 
     def __call__(self, texels: Texels, size: int, report: Report) -> UInt8[ndarray, "size size 3"]:
-        """Return the picture; between charts the nearest colour goes on, so that no seam shows."""
+        """Return the picture; between charts the nearest color goes on, so that no seam shows."""
         scores = self.vertex_scores(report)
         colors = torch.zeros(len(texels.row), 3)
         seen = torch.zeros(len(texels.row), dtype=torch.bool)

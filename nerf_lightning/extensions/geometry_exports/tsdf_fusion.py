@@ -74,7 +74,7 @@ def _add(first, last, distance, weight, across, numbers, camera, depth, trust):
 @njit(error_model="numpy")
 @no_type_check
 def _depth_at(depth, column, line, truncation):
-    """Between the centres of four pixels where they see one surface; else that of the pixel itself."""
+    """Between the centers of four pixels where they see one surface; else that of the pixel itself."""
     own = depth[int(line), int(column)]
     j = min(max(int(np.floor(column - HALF)), 0), depth.shape[1] - 2)
     i = min(max(int(np.floor(line - HALF)), 0), depth.shape[0] - 2)

@@ -1,4 +1,4 @@
-"""Density and colour on a regular grid over the scene's box."""
+"""Density and color on a regular grid over the scene's box."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,8 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-BYTES_PER_POINT = 12  # Density, colour, and the density again in the user's units.
-LEAST_ALPHA = 1e-3  # A cell less opaque than this has no colour.
+BYTES_PER_POINT = 12  # Density, color, and the density again in the user's units.
+LEAST_ALPHA = 1e-3  # A cell less opaque than this has no color.
 COSTS = {"density": 2.0, "colours": 3.0}
 
 

@@ -1,4 +1,4 @@
-"""Coarse scales as frequency features, each weighted by a learnt factor, fine scales as a hash grid (Hyb-NeRF)."""
+"""Coarse scales as frequency features, each weighted by a learned factor, fine scales as a hash grid (Hyb-NeRF)."""
 
 from typing import Literal
 
@@ -22,18 +22,19 @@ class HybridEncoder(ConeEncoder):
     """(alpha gamma(x), h(x)): gamma of sines and cosines, h of a hash grid, alpha = tanh(MLP(h, cone)), per feature.
 
     After Hyb-NeRF (arXiv 2311.12490, WACV 2024), whose sizes are told by others. Sines and cosines of low frequencies
-    need no tables, and the factor makes them a function of the place: where the grid has learnt that there is nothing
+    need no tables, and the factor makes them a function of the place: where the grid has learned that there is nothing
     of a frequency, it is switched off.
 
     Args:
         coarse: features of the coarse scales, gamma.
         fine: hash grid of the fine scales, h; None: there is none.
-        factor: what the coarse features are multiplied with: `learnt` as above; `one` leaves them as they are.
+        factor: the factor of the coarse features: `learnt` as above; `one` leaves them unchanged.
         width: width of the two hidden layers of the factor's MLP.
-        cones: whether the factor also sees the covariance of the pixel's cone, in squares of the grid's finest cell.
+        cones: whether the factor also depends on the covariance of the pixel's cone, in squares of the grid's finest
+            cell.
 
     Raises:
-        ValueError: a factor is to be learnt where there is no grid to learn it from, or cones where it is not learnt.
+        ValueError: a factor is to be learned where there is no grid to learn it from, or cones where it is not learned.
     """
 
     needs_unit_cube = True
@@ -51,7 +52,7 @@ class HybridEncoder(ConeEncoder):
         if factor == "learnt" and fine is None:
             raise ValueError("fine=null leaves nothing to learn the factor from: give a hash grid, or factor=one")
         if cones and factor == "one":
-            raise ValueError("cones=true with factor=one: the learnt factor is what sees cones; leave one of them out")
+            raise ValueError("cones=true with factor=one: the learned factor is what sees cones; leave one of them out")
         self.coarse, self.fine, self.factor, self.sees_cones = coarse, fine, factor, cones
         self.cone = FrequencyEncoder(CONE_OCTAVES, include_input=False)
         self.factor_mlp = nn.ParameterList()

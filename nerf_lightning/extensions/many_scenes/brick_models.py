@@ -1,6 +1,6 @@
 """Models of bricks beside the fire engine: random vehicles and towers, each a function of its number alone.
 
-They differ in what they are, in shape, in colours, in how they are turned and in where the light comes from.
+They differ in what they are, in shape, in colors, in how they are turned and in where the light comes from.
 """
 
 from collections.abc import Sequence
@@ -32,10 +32,10 @@ class BrickModelReader(BricksReader):
     """Render a random model of bricks as the embedded scene is, with exact depth and normals.
 
     Args:
-        variant: which model: 0 is the fire engine; each other number is a vehicle or a tower of its own, in its own
-            colours and light.
-        gain: every colour c (an sRGB code between 0 and 1) is photographed as gain * c^gamma, as a camera with other
-            settings would show it.
+        variant: which model: 0 is the fire engine; every other number is a different vehicle or tower, with its own
+            colors and light.
+        gain: every color c (sRGB, between 0 and 1) is photographed as gain * c^gamma, as by a camera with other
+            settings.
         gamma: see gain.
     """
 

@@ -67,7 +67,7 @@ class Draws:
         return self.number(what, 0.0, 1.0) < share
 
     def paints(self, count: int) -> list[Material]:
-        """Return materials of bricks, no two of one colour."""
+        """Return materials of bricks, no two of one color."""
         left, paints = list(COLORS), []
         for number in range(count):
             color = left.pop(self.whole(f"paint.{number}", 0, len(left) - 1))

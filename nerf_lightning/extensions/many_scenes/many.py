@@ -7,7 +7,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.data.captures.reader import Spaces
+from nerf_lightning.data.captures.scene import Spaces
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.extensions.many_scenes.brick_models import BrickModelReader
@@ -28,22 +28,22 @@ class ManyReader(Reader):
     """Read several captures, each in its own frame, and join them into one scene.
 
     Args:
-        root: a folder whose folders are captures, each read as scene=auto reads it; null: models of the bricks family.
-        variants: numbers of bricks models to learn from, such as 1-50 or "1-8 12" (scene=brick_model scene.variant=N).
-        unseen: captures that are never trained on, and by which alone the model is judged: of a folder their names, or
-            patterns of * and ?, with spaces between; of bricks models numbers, written as `variants`. null: each
-            capture is judged by views of its own that are held out.
+        root: a folder of captures, each read like scene=auto; null: bricks models.
+        variants: numbers of bricks models for training, such as 1-50 or "1-8 12" (scene=brick_model scene.variant=N).
+        unseen: captures held out from training, on which the model is then evaluated: names or patterns of * and ? in a
+            folder, separated by spaces; numbers of bricks models, written like `variants`. null: the model is evaluated
+            on held-out views of each capture.
         resolution: of bricks models: width and height of every picture in pixels.
         num_train: of bricks models: number of training views of each.
         num_val: of bricks models: number of validation views of each.
         num_test: of bricks models: number of test views of each.
-        gain: of bricks models: every colour c is photographed as gain * c^gamma.
+        gain: of bricks models: every color c is photographed as gain * c^gamma.
         gamma: of bricks models: see gain.
-        downscale: of a folder: whole factor by which the photographs shrink.
-        hold_every: of a folder: the first and every k-th view after it are held out, where the format names no split.
-        space: of a folder: bounded, contracted, or auto, which each capture must then be alike in.
-        background: what lies behind transparent pixels: white, black, random or none.
-        cache_dir: where rendered and decoded pictures are kept; null: the user's cache folder.
+        downscale: of a folder: integer factor by which photographs are shrunk.
+        hold_every: of a folder: the first and every k-th view after it are held out, if the format names no split.
+        space: of a folder: bounded, contracted, or auto, which must choose the same for all captures.
+        background: the background of transparent pixels: white, black, random or none.
+        cache_dir: where rendered and decoded images are kept; null: the user's cache folder.
         allow_outside: of a folder: follow names and links that lead out of a capture.
         name: the scene's name in reports.
     """

@@ -22,7 +22,7 @@ from nerf_lightning.extensions.many_scenes.draws import Draws, studs
 
 
 def vehicle(draws: Draws) -> list[Part]:
-    """Return a vehicle, its front towards x."""
+    """Return a vehicle, its front toward x."""
     half, wide = draws.number("length", 3.2, 6.2), draws.number("width", 1.8, 2.9)
     radius = draws.number("wheels", 0.75, 1.35)
     floor = radius + draws.number("clearance", 0.5, 1.0)
@@ -99,7 +99,7 @@ def _tank(draws: Draws, rear: float, front: float, wide: float, floor: float, pa
 
 
 def _stack(draws: Draws, rear: float, front: float, wide: float, floor: float, paint: Material) -> list[Part]:
-    """Low walls, and bricks, barrels and balls of many colours between them."""
+    """Low walls, and bricks, barrels and balls of many colors between them."""
     parts = [
         block((rear, -wide, floor), (front, 0.3 - wide, floor + 0.8), paint),
         block((rear, wide - 0.3, floor), (front, wide, floor + 0.8), paint),

@@ -54,7 +54,7 @@ class MetashapeReader(CaptureReader):
     """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
 
     Args:
-        file: the xml below root; null: the only one there.
+        file: the XML file below root; null: the only one there.
     """
 
     named_by = (".xml",)
@@ -159,7 +159,7 @@ def _sensor(sensor: Element | None, number: str, path: Path) -> Sensor:
         return _number(adjusted.findtext(key, "0"), path)
 
     f, b1 = number_of("f"), number_of("b1")
-    # Metashape's P1 and P2 are OpenCV's p2 and p1; its centre counts from the middle of the picture.
+    # Metashape's P1 and P2 are OpenCV's p2 and p1; its center counts from the middle of the picture.
     k1, k2, k3, k4, p2, p1 = (number_of(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     center = (width / 2 + number_of("cx"), height / 2 + number_of("cy"))
     return Sensor(LENSES[kind], (width, height), (f + b1, f), center, (k1, k2, k3, k4, p1, p2))

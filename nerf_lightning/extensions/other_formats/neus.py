@@ -114,7 +114,7 @@ def _view(picture: Path, name: str, projection: Float[ndarray, "3 4"], where: st
 def _decomposed(
     projection: Float[ndarray, "3 4"], where: str
 ) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3 3"], Float[ndarray, "3"]]:
-    """Return K, R (world to camera) and the centre of P = K [R | -R c], by an RQ decomposition."""
+    """Return K, R (world to camera) and the center of P = K [R | -R c], by an RQ decomposition."""
     flipped = np.flipud(projection[:, :3]).T
     if not np.isfinite(projection).all() or abs(np.linalg.det(flipped)) < 1e-12:
         raise InputError(f"{where} is no projection: it holds NaN or infinity, or is singular. {CURE}")

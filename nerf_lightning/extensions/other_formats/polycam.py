@@ -20,10 +20,10 @@ FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 @dataclass
 class PolycamReader(CaptureReader):
-    """Read the raw data that Polycam exports in its developer mode. Units are metres; y is up.
+    """Read the raw data that Polycam exports in its developer mode. Units are meters; y is up.
 
     Args:
-        depth_unit: length of a level of the 16-bit depth maps, in metres.
+        depth_unit: length of one level of the 16-bit depth maps, in meters.
     """
 
     name: str = "polycam"

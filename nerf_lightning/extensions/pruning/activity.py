@@ -62,7 +62,7 @@ def mean_activity(
 
 @contextmanager
 def _written_down(fields: Mapping[str, Field], asked: list[tuple[str, Points]]) -> Iterator[None]:
-    """Write down what fields are asked about, be it density alone or colour."""
+    """Write down what fields are asked about, be it density alone or color."""
     hooks = []
     for name, field in fields.items():
 

@@ -43,7 +43,7 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
             f"trained. Leave it out, and fine-tune with nerf train, the run's settings, {_told(widths)} and "
             "init_from=CHECKPOINT."
         )
-    # What a run does at its start alone, a look at the pictures' centres first, is for weights that know nothing.
+    # What a run does at its start alone, a look at the pictures' centers first, is for weights that know nothing.
     length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
     former = open_sections([*former_overrides(folder, length), *length])
     config, choices = compose_config("train", former)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float64
 from torch import Tensor
 
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
-from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
+from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.extensions.splats.files import SplatFormat, moved, require_library, save_splats
+from nerf_lightning.extensions.splats.files import HALF_TURN, SplatFormat, moved, require_library, save_splats
 from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
@@ -44,8 +44,10 @@ class SplatsExport(Export):
         num_splats: at most so many; auto: 200 for each pixel of a view's side, at most 150,000.
         seconds: of fitting to the training photographs; without them, or where the model has a correction for each
             camera, to pictures of the field; 0: as they lie on the field's surfaces.
-        sh_degree: of the spherical harmonics of colours, 0 to 3.
+        sh_degree: of the spherical harmonics of colors, 0 to 3.
         format: of the file. SPZ needs `pip install 'nerf-lightning[splats]'`.
+        frame: upright, turned until what is up is up in viewers; capture: the capture's own axes (GLB is always
+            upright).
         longest: pixels of the longer side of the pictures that are fitted to, at most.
         max_views: most held-out views that splats and field are compared on.
         seed: of the splats that are drawn, and of the order of views.
@@ -58,6 +60,7 @@ class SplatsExport(Export):
     seconds: float = 60.0
     sh_degree: int = 2
     format: SplatFormat = "ply"
+    frame: Literal["upright", "capture"] = "upright"
     longest: int = 800
     max_views: int = 16
     seed: int = 0
@@ -91,7 +94,7 @@ class SplatsExport(Export):
                 with torch.enable_grad():
                     gaussians = fit(gaussians, views, around.views(), fitting, report)
             measured, panels = self._measured(gaussians, model, record, scene, pinholes, tile_points, report)
-        save_splats(path, moved(gaussians, record.to_user.double()), to_gltf(record))
+        save_splats(path, moved(gaussians, self._to_file(record)))
         whole: dict[str, Any] = {"splats": len(gaussians), "bytes": path.stat().st_size}
         whole |= {"seconds": round(time.monotonic() - began, 1), "fitting_seconds": self.seconds}
         whole |= {"fitted_to": "the field" if photographs is None else "photographs"} | measured
@@ -102,7 +105,6 @@ class SplatsExport(Export):
         return [path, facts, picture]
 
     def _require_possible(self, record: SceneRecord) -> None:
-        refuse_ndc(record, "splats")
         if record.cameras.lens_model == "equirectangular":
             raise InputError(
                 f"what=splats: {record.name} is made of panoramas, and splats are fitted to pictures that a "
@@ -113,6 +115,19 @@ class SplatsExport(Export):
         for module in KERNELS:
             if backend(module) is None:
                 raise InputError(f"what=splats needs numba, which cannot be used here ({why_not(module)}).")
+
+    def _to_file(self, record: SceneRecord) -> Float64[Tensor, "4 4"]:
+        """Return what takes scene coordinates to the file's: the capture's own, or turned until y points down.
+
+        glTF also wants meters, as far as they are known.
+        """
+        to_user = record.to_user.double()
+        if self.frame == "capture" and self.format != "glb":
+            return to_user
+        up = torch.tensor([0.0, 1.0, 0.0] if record.space == "ndc" else [0.0, 0.0, 1.0], dtype=torch.float64)
+        matrix = HALF_TURN @ y_up(directions_to_user(up, to_user)) @ to_user
+        matrix[:3] *= (record.metres_per_unit or 1.0) if self.format == "glb" else 1.0
+        return matrix
 
     def _budget(self, pinholes: Cameras) -> int:
         pixels = int((pinholes.width * pinholes.height).double().mean())
@@ -153,7 +168,7 @@ class SplatsExport(Export):
 
 
 def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras) -> list[View]:
-    """Return the photographs that the model learnt from, by its record, and of which anything counts."""
+    """Return the photographs that the model learned from, by its record, and of which anything counts."""
     trained = {record.view_names[view] for view in record.splits["train"]}
     known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
     views = [photographed(scene, view, pinholes) for view in known]
@@ -164,14 +179,6 @@ def extent(cameras: Cameras) -> float:
     """Return how far the cameras are from their middle, at most (scene units)."""
     eyes = cameras.c2w[:, :, 3]
     return max(float((eyes - eyes.mean(dim=0)).norm(dim=-1).max()), 1e-6)
-
-
-def to_gltf(record: SceneRecord) -> Float[Tensor, "4 4"]:
-    """Return what takes the capture's frame to glTF's, where y is up and a unit is a metre, as far as that is known."""
-    up = directions_to_user(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), record.to_user.double())
-    matrix = y_up(up)
-    matrix[:3] *= record.metres_per_unit or 1.0
-    return matrix
 
 
 def _lines(known: dict[str, Any]) -> list[str]:

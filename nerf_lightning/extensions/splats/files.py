@@ -1,7 +1,7 @@
 """Splat files: PLY as 3DGS wrote it, SPZ 3 (Niantic), and glTF with KHR_gaussian_splatting (Khronos).
 
-Each is whole or not there. PLY and SPZ say nothing of up and units, and keep the capture's own; SPZ's axes are right,
-up, back where PLY's are right, down, front, so that programs turn y and z when they read it.
+Each is whole or not there. PLY's axes are right, down, front; those of SPZ and glTF are right, up, back, so y and z are
+negated there.
 """
 
 import json
@@ -27,10 +27,11 @@ from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotatio
 SplatFormat = Literal["ply", "spz", "glb"]
 FINE = 0.05  # SPZ's places are whole numbers of steps, so large a share of the splats' median size or smaller.
 LARGEST_PLACE = 1 << 23  # And so many steps from the origin.
+HALF_TURN = torch.diag(torch.cat([TURN, torch.ones(1)])).double()
 
 
 def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
-    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colours."""
+    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colors."""
     unit = unit_of(matrix)
     rotation = matrix[:3, :3] / unit
     axes = rotation @ rotation_from_quaternion(gaussians.quaternions.double())
@@ -47,7 +48,7 @@ def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
 def turned_harmonics(
     sh_rest: Float[Tensor, "n coefficients 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n coefficients 3"]:
-    """Return the coefficients of the same colours in a turned frame.
+    """Return the coefficients of the same colors in a turned frame.
 
     The harmonics of a degree turn among themselves: Y(R^T d) = Y(d) M for every direction d. Here M is what least
     squares finds for more directions than harmonics, which is exact.
@@ -62,21 +63,15 @@ def turned_harmonics(
     return torch.einsum("jk,nkc->njc", matrix, sh_rest.double()).to(sh_rest)
 
 
-def save_splats(path: Path, gaussians: Gaussians, to_gltf: Float[Tensor, "4 4"]) -> None:
-    """Write splats of the capture's frame in the format of the file's name.
-
-    Args:
-        path: .ply, .spz or .glb.
-        gaussians: in the capture's frame.
-        to_gltf: similarity that takes that to glTF's, where y is up and a unit is a metre; no other format has one.
-    """
-    writers = {".ply": ply_bytes, ".spz": None, ".glb": lambda splats: glb_bytes(moved(splats, to_gltf))}
-    write = writers[path.suffix]
+def save_splats(path: Path, gaussians: Gaussians) -> None:
+    """Write splats, whose axes are right, down, front, in the format of the file's name: .ply, .spz or .glb."""
     with whole_file(path) as part:
-        if write is None:
-            write_spz(part, gaussians)
+        if path.suffix == ".ply":
+            part.write_bytes(ply_bytes(gaussians))
+        elif path.suffix == ".spz":
+            write_spz(part, moved(gaussians, HALF_TURN))
         else:
-            part.write_bytes(write(gaussians))
+            part.write_bytes(glb_bytes(moved(gaussians, HALF_TURN)))
 
 
 def ply_bytes(gaussians: Gaussians) -> bytes:
@@ -94,12 +89,9 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     return "\n".join(header).encode() + _floats(torch.cat([each.double() for each in columns], dim=1)).tobytes()
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write SPZ 3 by gsply, which writes numbers as they are: y and z are turned here, as the format wants them."""
+def write_spz(path: Path, splats: Gaussians) -> None:
+    """Write SPZ 3 by gsply, which writes numbers as they are."""
     gsply = require_library()
-    half_turn = torch.eye(4, dtype=torch.float64)
-    half_turn[:3, :3] = torch.diag(TURN)
-    splats = moved(gaussians, half_turn)
     size = splats.log_scales.amax(dim=1).exp().median()
     farthest = float(splats.means.abs().max().clamp(min=1e-6))
     bits = math.ceil(-math.log2(FINE * float(size)))

@@ -76,7 +76,7 @@ def _in_random_order(views: Sequence[View], generator: torch.Generator) -> Itera
 
 
 def _background(background: Background, generator: torch.Generator) -> Float[Tensor, "3"]:
-    if background in DRAWN:  # a haze would take its colour
+    if background in DRAWN:  # a haze would take its color
         return torch.rand(3, generator=generator)
     return color_behind(background)
 

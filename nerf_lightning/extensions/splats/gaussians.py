@@ -38,10 +38,10 @@ class Gaussians:
     log_scales: Float[Tensor, "n 3"]
     """Logarithms of the standard deviations along the splat's own axes, in scene units."""
     quaternions: Float[Tensor, "n 4"]
-    """(w, x, y, z) of the rotation whose columns are the splat's axes; normalised wherever it is used."""
+    """(w, x, y, z) of the rotation whose columns are the splat's axes; normalized wherever it is used."""
     opacity_logits: Float[Tensor, "n"]
     sh_dc: Float[Tensor, "n 3"]
-    """Spherical harmonics of the colour, which is 0.5 plus their sum, and not below 0: the one that is constant,"""
+    """Spherical harmonics of the color, which is 0.5 plus their sum, and not below 0: the one that is constant,"""
     sh_rest: Float[Tensor, "n coefficients 3"]
     """and the 0, 3, 8 or 15 of degree 1 to 3."""
 
@@ -78,8 +78,9 @@ class Pinhole:
 
     @classmethod
     def of(cls, cameras: Cameras, view: int, near: float) -> "Pinhole":
-        """Return one of the cameras without its lens."""
+        """Return one of the cameras without its lens; in normalized device coordinates content begins at z = -1."""
         c2w = cameras.c2w[view]
+        near = near if cameras.ndc is None else 1.0 + float(c2w[2, 3])
         (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
         size = int(cameras.width[view]), int(cameras.height[view])
         return cls(TURN.to(c2w)[:, None] * c2w[:, :3].mT, c2w[:, 3], (fx, fy), (cx, cy), *size, near)
@@ -126,7 +127,7 @@ def jacobian_limits(camera: Pinhole) -> tuple[float, float]:
 
 
 def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-    """Return the colours seen from a place; no gradient goes through the direction, which hardly moves."""
+    """Return the colors seen from a place; no gradient goes through the direction, which hardly moves."""
     directions = normalize(gaussians.means.detach() - eye, dim=-1)
     basis = SphericalHarmonicsEncoder(gaussians.sh_degree + 1)(directions)
     sh = torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], dim=1)
@@ -134,5 +135,5 @@ def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"
 
 
 def dc_of_color(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return the constant coefficient of a colour that is the same from everywhere."""
+    """Return the constant coefficient of a color that is the same from everywhere."""
     return (rgb - 0.5) / DEGREE_1

@@ -1,7 +1,7 @@
 """What the field shows around the photographs, and where splats begin: on its surfaces, flat.
 
 3DGS begins with the few points of structure from motion and makes more of them as it goes; a field knows a point, a
-normal and a colour for every pixel. It is looked at from between the photographs and beyond, through wider lenses: what
+normal and a color for every pixel. It is looked at from between the photographs and beyond, through wider lenses: what
 few photographs see, or none, is where splats would go wrong.
 """
 
@@ -30,7 +30,7 @@ BEYOND = 0.5  # or beyond one of the two, by up to this share of the way.
 LEAST_OPACITY = 0.5  # Pixels that stop less light see no surface.
 TOLERANCE = 0.03  # Of the distance: a point stays where the surface of one of the nearest views is as near.
 OPACITY = 0.6
-SPREAD = 0.4  # Standard deviation along the surface, in distances to the three nearest neighbours.
+SPREAD = 0.4  # Standard deviation along the surface, in distances to the three nearest neighbors.
 FLAT = 0.2  # And across it, as a share of that.
 NEIGHBOURS = 3
 
@@ -63,7 +63,7 @@ def look_around(model: Model, record: SceneRecord, tile_points: int, seed: int, 
 
 
 def _between(cameras: Cameras, views: Sequence[int], generator: torch.Generator) -> Cameras:
-    # Axes are mixed like centres, and then the nearest rotation is taken, by SVD.
+    # Axes are mixed like centers, and then the nearest rotation is taken, by SVD.
     order = torch.randperm(max(COUNT, len(views)), generator=generator)[:COUNT].tolist()
     chosen, others = [views[k % len(views)] for k in order], []
     for view in chosen:

@@ -1,6 +1,6 @@
 """Splats to the screen and gradients back, for the CPU: `gaussians.project` and `gaussians.colors`, fused.
 
-A row of `screen` is one splat: mean (x, y), conic (a, b, c), opacity, colour, half width and half height of the box
+A row of `screen` is one splat: mean (x, y), conic (a, b, c), opacity, color, half width and half height of the box
 that it is visible in (pixels), and depth, which is 0 for splats that are not drawn. Gradients on the screen have its
 first nine columns.
 """

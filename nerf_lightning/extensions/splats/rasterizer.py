@@ -33,7 +33,7 @@ def rasterize(
     Args:
         gaussians: float32, on the CPU. A splat with a number that is not finite is not drawn.
         camera: where from.
-        background: colour behind the splats.
+        background: color behind the splats.
         on_screen: zeros that require a gradient: they get that of each splat's mean on the screen (per pixel).
     """
     picture: Tensor = _Rasterize.apply(*gaussians.tensors().values(), on_screen, camera, background)

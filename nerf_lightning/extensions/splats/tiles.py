@@ -99,7 +99,7 @@ def _is_dark(light):
 @njit
 @no_type_check
 def _splat(row, x0, y0):
-    # A splat as a tile sees it: mean, conic, opacity, colour, and the rows of pixels that it is visible in.
+    # A splat as a tile sees it: mean, conic, opacity, color, and the rows of pixels that it is visible in.
     mean_x, mean_y = row[MEAN_X] - np.float32(x0) - HALF, row[MEAN_Y] - np.float32(y0) - HALF
     top, bottom = max(math.ceil(mean_y - row[REACH_Y]), 0), min(math.floor(mean_y + row[REACH_Y]), SIDE - 1)
     shape = mean_x, mean_y, row[CONIC_A], row[CONIC_B], row[CONIC_C]
@@ -110,7 +110,7 @@ def _splat(row, x0, y0):
 @no_type_check
 def blend(first, last, across, screen, splats, starts, background, picture):
     """Fill the pixels of some tiles; the picture has whole tiles."""
-    # Light that is left, and the three colours. One array, so that LLVM knows that its parts lie apart.
+    # Light that is left, and the three colors. One array, so that LLVM knows that its parts lie apart.
     px = np.empty(4 * AREA, np.float32)
     for tile in range(first, last):
         x0, y0 = tile % across * SIDE, tile // across * SIDE
@@ -142,11 +142,11 @@ def blend(first, last, across, screen, splats, starts, background, picture):
 def blend_back(first, last, across, screen, splats, starts, picture, gradient, parts):
     """Fill the gradient of each splat in each of some tiles: rows of `parts`, the first nine columns of the screen's.
 
-    With g the gradient of a pixel and C its colour: dL/dalpha_i = T_i c_i.g - R_i.g / (1 - alpha_i), where
+    With g the gradient of a pixel and C its color: dL/dalpha_i = T_i c_i.g - R_i.g / (1 - alpha_i), where
     R_i = C - sum over j <= i of T_j alpha_j c_j is what lies behind. Nearest first again, so that the light is to the
     bit what it was.
     """
-    # Light that is left, R.g, and the gradient's three colours.
+    # Light that is left, R.g, and the gradient's three colors.
     px = np.empty(5 * AREA, np.float32)
     for tile in range(first, last):
         x0, y0 = tile % across * SIDE, tile // across * SIDE

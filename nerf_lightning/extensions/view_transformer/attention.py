@@ -135,5 +135,5 @@ class FeedForward(nn.Module):
         return states + self.change(self.norm(states))
 
     def change(self, normed: Float[Tensor, "*points width"]) -> Float[Tensor, "*points width"]:
-        """Return what is added to states, of the states normalised."""
+        """Return what is added to states, of the states normalized."""
         return self.out(functional.relu(self.wide(normed)))

@@ -20,7 +20,7 @@ class Block(nn.Module):
 
     Args:
         width: of the states.
-        heads: of the attention along the ray.
+        heads: heads of the attention along the ray.
         encoded: whether the encodings of points and directions enter.
         experts: in the place of the first feed-forward layer; 0: none.
     """

@@ -37,7 +37,7 @@ class Gates(TensorStruct):
 
 
 class Gate(nn.Module):
-    """Cosines between a projection of the state and a vector for each expert, over a learnt temperature.
+    """Cosines between a projection of the state and a vector for each expert, over a learned temperature.
 
     Args:
         width: of the states.
@@ -61,7 +61,7 @@ class Gate(nn.Module):
         """Return the gates.
 
         Args:
-            states: normalised.
+            states: normalized.
             noise: standard normal numbers; its deviation becomes 1 / E. None: none.
         """
         cosines = (
@@ -132,7 +132,7 @@ def _variation(of_points: Float[Tensor, "*points experts"]) -> Float[Tensor, ""]
 def roughness(gates: Gates, rays: RayBundle, target: Tensor) -> Float[Tensor, "rays"]:
     """Return how far the gates of each ray are from those of the nearest rays of its target, sample by sample.
 
-    The Kullback-Leibler divergences KL(neighbour | ray), weighted by the softmax of minus the distances of their
+    The Kullback-Leibler divergences KL(neighbor | ray), weighted by the softmax of minus the distances of their
     directions, in units of the mean distance to the nearest. Samples of one number lie nearest to each other.
     """
     with torch.no_grad():

@@ -14,7 +14,7 @@ ImageNorm = Literal["none", "instance", "neurn"]
 PATCH = 3
 """Side in pixels of the squares whose deviation is taken."""
 LEAST_DEVIATION = 1e-6
-"""Deviations below it, which only rounding makes of colours in [0, 1], count as none."""
+"""Deviations below it, which only rounding makes of colors in [0, 1], count as none."""
 
 
 def normalized(
@@ -23,7 +23,7 @@ def normalized(
     """Return pictures as the image network sees them.
 
     Args:
-        pictures: colours in [0, 1].
+        pictures: colors in [0, 1].
         kind: `none` shifts them to [-1, 1]; `instance` gives each channel of each picture mean 0 and deviation 1;
             `neurn` is `local_deviation`.
     """
@@ -40,7 +40,7 @@ def local_deviation(
     """Return the standard deviation around each pixel over the picture's largest, channel by channel, in [0, 1].
 
     NeuRN (arXiv 2505.06894), after neurons that answer to contrast. It is unchanged by gain and offset of a channel,
-    and 0 where all is of one colour. Beyond the border the outermost pixels are repeated.
+    and 0 where all is of one color. Beyond the border the outermost pixels are repeated.
     """
     flat = pictures.reshape(-1, *pictures.shape[-3:])
     around = functional.pad(flat, (patch // 2,) * 4, mode="replicate").unfold(-2, patch, 1).unfold(-2, patch, 1)
@@ -56,7 +56,7 @@ class ImageNetwork(Part):
     """Residual blocks at 1/2, 1/4, ... of the picture's size and one scale beyond that of the features, and back.
 
     The papers' is the first half of a ResNet34 with instance norm (arXiv 2102.13090). Here each scale has as many
-    blocks as the others, and halves the size by a 4 x 4 convolution that is centred between pixels, so that the
+    blocks as the others, and halves the size by a 4 x 4 convolution that is centered between pixels, so that the
     feature of row i stands at (i + 1/2) `scale` pixels.
 
     Args:

@@ -54,34 +54,34 @@ log = logging.getLogger(__name__)
 
 
 class ViewTransformer(Model):
-    """Photographs' features at the projections of a ray's points; attention over views, then along the ray; colour.
+    """Photographs' features at the projections of a ray's points; attention over views, then along the ray; color.
 
-    There is no density and no compositing: the colour is read off the points' states, over the background of the
+    There is no density and no compositing: the color is read off the points' states, over the background of the
     photographs. Opacity is 1, and 0 where no source sees the ray. Depth is the mean distance under the attention of the
     last block. Dropout is left out, so that a run has the same bits again.
 
     Args:
         sampler: where along the rays; evenly in inverse distance where a ray ends beyond 8 times its beginning.
-        width: of the states of points.
-        blocks: attention over views and attention along the ray, one after the other, so many times.
-        heads: of the attention along the ray.
-        num_sources: photographs that a view is rendered from; in training up to two more or fewer.
+        width: width of the states of points.
+        blocks: number of blocks, each with attention across views, then along the ray.
+        heads: heads of the attention along the ray.
+        num_sources: photographs from which a view is rendered; in training up to two more or fewer.
         image_features: channels of the image network.
         image_scale: pixels of a photograph per feature, along each side: 2, 4 or 8.
         image_width: channels of the image network at half the photographs' size.
         image_blocks: residual blocks of the image network at each of its sizes.
-        image_rate: learning rate of the image network at the beginning; null: that of all.
-        image_norm: what is done to photographs before the image network, against exposures that differ: none;
-            instance (mean 0 and deviation 1 in each channel); neurn (the local deviation, arXiv 2505.06894).
-        start: what the state of a point begins with: largest (in each channel the largest of its views, as
-            published), or spread (and how far they differ, which says whether they see the same thing).
-        color: what makes a ray's colour of the states of its points: pooled (a linear layer on their mean, as
-            published), or blended (the sources' colours, weighted by two attentions, and what the mean adds; it learns
-            in fewer steps).
-        experts: so many experts in the place of the feed-forward layer after the views in every second block, of
-            which two are asked about each point (GNT-MOVE, ICCV 2023); 0: none.
-        balance: weight of the loss that makes the experts be asked equally often.
-        smoothness: weight of the loss that makes rays beside each other ask the same experts.
+        image_rate: the initial learning rate of the image network; null: that of the rest.
+        image_norm: how photographs are normalized before the image network, against different exposures: none; instance
+            (mean 0 and standard deviation 1 in each channel); neurn (the local deviation, arXiv 2505.06894).
+        start: the initial state of a point: largest (the maximum over views in each channel, as published), or spread
+            (also their variance, which shows whether they see the same point).
+        color: how a ray's color follows from the states of its points: pooled (a linear layer on their mean, as
+            published), or blended (the source colors, weighted by two attentions, plus a correction from the mean;
+            learns in fewer steps).
+        experts: number of experts that replace the feed-forward layer after the views in every second block, with top-2
+            routing per point and one shared expert (GNT-MOVE, ICCV 2023); 0: none.
+        balance: weight of the load-balancing loss.
+        smoothness: weight of the smoothness loss: neighboring rays should choose the same experts.
 
     Raises:
         ValueError: a number out of its range, a width that the heads cannot share.

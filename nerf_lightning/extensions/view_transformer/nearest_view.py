@@ -1,7 +1,7 @@
 """What photographs give without a model: the nearest one, and a blend of the nearest ones, in the place of a view.
 
 A model of many scenes has to be better than that. Both are also looked at through a plane: each ray meets the plane
-through what the cameras look at, across the view's axis, and shows the colour of that point in the photographs, as
+through what the cameras look at, across the view's axis, and shows the color of that point in the photographs, as
 light fields are rendered (Levoy and Hanrahan, SIGGRAPH 1996). No depth is known or guessed. The photographs are those
 that the models render from (`source_views.choose_sources`).
 """
@@ -77,7 +77,7 @@ class NearestViews:
 
 
 def _mean(colors: Float[Tensor, "rays sources 3"], weights: Tensor) -> Float[Tensor, "rays 3"]:
-    """Return the weighted mean of colours; white where all weights are 0."""
+    """Return the weighted mean of colors; white where all weights are 0."""
     total = weights.sum(dim=1, keepdim=True)
     return torch.where(total > 0, (weights[..., None] * colors).sum(dim=1) / total.clamp(min=1e-12), 1.0)
 

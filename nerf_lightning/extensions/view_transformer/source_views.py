@@ -1,7 +1,7 @@
 """Which photographs a ray is rendered from: those taken from nearest to where it is seen from.
 
 As IBRNet picks them (arXiv 2102.13090): by direction from the content where cameras stand around it, else by distance.
-In training out of a larger pool, and more or fewer, so that no arrangement is learnt by heart.
+In training out of a larger pool, and more or fewer, so that no arrangement is learned by heart.
 """
 
 from dataclasses import dataclass

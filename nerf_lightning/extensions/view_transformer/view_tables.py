@@ -1,4 +1,4 @@
-"""Colours and features of photographs in tables of rows, and looking them up between pixels."""
+"""Colors and features of photographs in tables of rows, and looking them up between pixels."""
 
 import functools
 import threading
@@ -17,7 +17,7 @@ from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.photographs import Photographs
 
 KEPT_BYTES = 1 << 28
-"""Of colours, and of features, that are kept for the next rays."""
+"""Of colors, and of features, that are kept for the next rays."""
 AT_ONCE = 16
 """Pictures that go through the image network together."""
 
@@ -37,7 +37,7 @@ class ViewTable:
     def look_up(
         self, view: Int[Tensor, "*#points"], at: Float[Tensor, "*points 2"]
     ) -> Float[Tensor, "*points channels"]:
-        """Return what lies at places in views, between four neighbours; at the border the outermost are repeated.
+        """Return what lies at places in views, between four neighbors; at the border the outermost are repeated.
 
         Args:
             view: its number in this table.
@@ -77,7 +77,7 @@ class ViewTables:
         self.least_cosine, self.size = self.least_cosine.to(device), self.size.to(device)
 
     def colors(self, views: Int[Tensor, "views"], numbers: Sequence[int]) -> ViewTable:
-        """Return the colours of views in [0, 1], over the background of evaluation.
+        """Return the colors of views in [0, 1], over the background of evaluation.
 
         Args:
             views: which, on the device that these tables were moved to.

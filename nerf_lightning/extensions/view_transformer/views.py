@@ -17,7 +17,7 @@ class Views(TensorStruct):
     """What the sources show at the points of rays."""
 
     states: Float[Tensor, "rays samples sources width"]
-    """Colour and features together."""
+    """Color and features together."""
     colors: Float[Tensor, "rays samples sources 3"]
     """In [0, 1]."""
     turned: Float[Tensor, "rays samples sources 4"]
@@ -42,7 +42,7 @@ class Largest(nn.Module):
 
 
 class Spread(Largest):
-    """And a linear layer on the mean and the deviation of the views' colours, and on the variance of their states.
+    """And a linear layer on the mean and the deviation of the views' colors, and on the variance of their states.
 
     As IBRNet begins (arXiv 2102.13090): where views differ, they do not see the same thing.
 
@@ -74,7 +74,7 @@ def moments(
 
 
 class PooledColor(nn.Module):
-    """A linear layer on the mean of the normalised states, as published (arXiv 2207.13298).
+    """A linear layer on the mean of the normalized states, as published (arXiv 2207.13298).
 
     Args:
         width: of the states.
@@ -88,16 +88,16 @@ class PooledColor(nn.Module):
     def forward(
         self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
-        """Return colours, and the weights of samples as they were given: those of the last attention."""
+        """Return colors, and the weights of samples as they were given: those of the last attention."""
         return self.color(self.norm(states.float()).mean(dim=1)), weights
 
 
 class BlendedColor(nn.Module):
-    """sum_s a_s sum_v b_sv c_sv, the sources' own colours, and what the pooled state adds to them.
+    """sum_s a_s sum_v b_sv c_sv, the sources' own colors, and what the pooled state adds to them.
 
     a is a softmax along the ray, over the points that any source sees, b one over the sources of a point, as IBRNet
-    blends (arXiv 2102.13090). It begins as the mean of all colours that a ray's points have in the sources, and has to
-    learn where they agree, but not what colours are.
+    blends (arXiv 2102.13090). It begins as the mean of all colors that a ray's points have in the sources, and has to
+    learn where they agree, but not what colors are.
 
     Args:
         width: of the states.
@@ -113,7 +113,7 @@ class BlendedColor(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Begin with nothing added to the sources' colours."""
+        """Begin with nothing added to the sources' colors."""
         nn.init.zeros_(self.color.weight)
         nn.init.zeros_(self.color.bias)
 
@@ -121,7 +121,7 @@ class BlendedColor(nn.Module):
     def forward(
         self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
-        """Return colours, and the weights of samples in them."""
+        """Return colors, and the weights of samples in them."""
         states = self.norm(states.float())
         of_views = self.of_view(views.states) + self.of_turn(views.turned) + self.of_state(states)[..., None, :]
         which = self.which(functional.relu(of_views.float()))[..., 0].masked_fill(~views.visible, -1e9).softmax(dim=-1)

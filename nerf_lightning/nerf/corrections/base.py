@@ -15,27 +15,27 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class Correction(Part, ABC):
-    """Map the colours that a model renders to those that a photograph shows of them.
+    """Map the colors that a model renders to those that a photograph shows of them.
 
     A step of training applies it after compositing and before the loss, so that the model need not explain what
     differs from photograph to photograph. Nothing else does: validation, evaluation, films, exports and the viewer show
-    the model's own, neutral colours. As it begins, it changes no bit.
+    the model's own, neutral colors. As it begins, it changes no bit.
     """
 
     def fit_to(self, scene: Scene) -> None:
         """Take note of the photographs, once, before training.
 
         Raises:
-            InputError: a single one trains, whose colours differ from none.
+            InputError: a single one trains, whose colors differ from none.
         """
         if len(scene.splits["train"]) < 2:
             raise InputError(
-                f"The scene {scene.name} trains on one photograph, and a correction learns how the colours of several "
+                f"The scene {scene.name} trains on one photograph, and a correction learns how the colors of several "
                 "differ: add correction=none, or give more photographs."
             )
 
     def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
-        """Return a rendering whose colours are those that photographs show.
+        """Return a rendering whose colors are those that photographs show.
 
         The scene's own light reached the camera. The background behind it did not: it looks the same to all.
 
@@ -48,16 +48,16 @@ class Correction(Part, ABC):
 
     @abstractmethod
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
-        """Return what photographs show of rendered colours.
+        """Return what photographs show of rendered colors.
 
         Args:
             rgb: sRGB-encoded, composited; in [0, 1] or somewhat beyond. So is what comes out, without a clamp.
-            pixels: where in which photograph each colour stands.
+            pixels: where in which photograph each color stands.
         """
 
 
 class NoCorrection(Correction):
-    """Leave every colour as it is: photographs show what there is."""
+    """Leave every color as it is: photographs show what there is."""
 
     def fit_to(self, scene: Scene) -> None:
         """Take any scene."""
@@ -67,5 +67,5 @@ class NoCorrection(Correction):
         return rendering
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
-        """Return the colours themselves."""
+        """Return the colors themselves."""
         return rgb

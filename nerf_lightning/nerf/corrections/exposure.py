@@ -20,8 +20,8 @@ class Exposure(Correction):
     over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
 
     Args:
-        learning_rate: of the stops; Adam moves each by at most about so much in a step.
-        mean_weight: factor on the sum of the squared means, which is added to the loss.
+        learning_rate: learning rate of the exposures, in stops; Adam changes each by at most about this per step.
+        mean_weight: weight of the sum of the squared means in the loss.
     """
 
     trained: Tensor
@@ -45,7 +45,7 @@ class Exposure(Correction):
         self.trained = torch.tensor(scene.splits["train"])
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
-        """Return the colours with their light scaled by the gains of their photographs."""
+        """Return the colors with their light scaled by the gains of their photographs."""
         return scale_light(rgb, self.gains()[pixels.view])
 
     def gains(self) -> Float[Tensor, "views 3"]:

@@ -21,8 +21,8 @@ class FrequencyEncoder(Encoder):
 
     Args:
         num_frequencies: L, the number of octaves.
-        include_input: whether x itself comes first.
-        with_pi: whether the frequencies carry the paper's factor pi.
+        include_input: whether the input itself comes first.
+        with_pi: whether frequencies have the paper's factor pi.
     """
 
     frequencies: Tensor
@@ -46,4 +46,4 @@ class FrequencyEncoder(Encoder):
         return torch.cat([points, waves], dim=-1) if self.include_input else waves
 
     def reset_parameters(self) -> None:
-        """Nothing is learnt here."""
+        """Nothing is learned here."""

@@ -1,4 +1,4 @@
-"""Learnt features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
+"""Learned features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
 
 import math
 
@@ -35,11 +35,11 @@ class HashGridEncoder(Encoder):
 
     Args:
         num_levels: number of grids.
-        features_per_level: numbers that a vertex of a grid holds.
-        log2_table_size: most entries of a level, as a power of two.
+        features_per_level: features per vertex.
+        log2_table_size: maximum number of entries per level, as a power of two.
         min_resolution: cells along a side of the coarsest grid.
         max_resolution: cells along a side of the finest grid; about the scene's size over its smallest detail.
-        blend_in: share of the run after which all levels are on; 0: they are from the start.
+        blend_in: share of the run over which levels are blended in, from coarse to fine; 0: all from the start.
 
     Raises:
         InputError: training the tables would not fit into the machine's memory.

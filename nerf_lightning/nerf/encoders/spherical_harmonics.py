@@ -7,7 +7,7 @@ from torch import Tensor
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.backends import cuda_backend
 
-# Normalised so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
+# Normalized so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
 DEGREE_1 = 0.28209479177387814  # 1 / (2 sqrt(pi))
 DEGREE_2 = 0.4886025119029199  # sqrt(3 / (4 pi))
 DEGREE_3 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
@@ -50,7 +50,7 @@ class SphericalHarmonicsEncoder(Encoder):
         return torch.stack(columns).movedim(0, -1).contiguous()  # written in one go, then turned: twice as fast
 
     def reset_parameters(self) -> None:
-        """Nothing is learnt here."""
+        """Nothing is learned here."""
 
 
 def _degree_4(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""The contract of a field: density and colour of points in space."""
+"""The contract of a field: density and color of points in space."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Field(Part, ABC):
     which is slow and right."""
 
     def set_precision(self, matmul_precision: MatmulPrecision) -> None:
-        """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""
+        """Set the precision of the products with the field's weights; positions, densities and colors stay float32."""
         for module in self.modules():
             if isinstance(module, Linear | Field | Encoder):
                 module.matmul_precision = matmul_precision
@@ -50,7 +50,7 @@ class Field(Part, ABC):
 
     @abstractmethod
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
-        """Return the density per unit length, without paying for colour.
+        """Return the density per unit length, without paying for color.
 
         Returns:
             The density; and features that spare `forward` what was computed here, None where it has no use for them.
@@ -58,7 +58,7 @@ class Field(Part, ABC):
 
     @abstractmethod
     def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
-        """Return density and colour.
+        """Return density and color.
 
         Args:
             points: with directions.

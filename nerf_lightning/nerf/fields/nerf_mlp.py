@@ -21,21 +21,21 @@ MOST_LAYERS = 100
 
 
 class NerfMLP(Field):
-    """Eight layers of 256 with one skip; density before the direction enters; a 128-wide colour head.
+    """Eight layers of 256 with one skip; density before the direction enters; a 128-wide color head.
 
     Args:
         position_encoder: features of positions, gamma(x).
         direction_encoder: features of directions, gamma(d).
         depth: number of trunk layers.
-        width: width of the trunk and of the feature; the colour head has half of it.
+        width: width of the trunk and of the feature; the color head has half of it.
         skip: index of the trunk layer (counted from 0) whose input is joined by the encoded position again; the
             paper's is 5, after the layer at index 4. None for no skip.
-        density_activation: relu as in the paper, or softplus, which cannot die.
+        density_activation: relu as in the paper, or softplus, whose gradient never vanishes.
         density_bias: added to the raw density before its activation; negative values start from empty space.
-        density_noise: standard deviation of the normal noise added to the raw density while training.
-        xavier: Glorot uniform weights and zero biases, as Keras has them; False for torch's own start.
-        contraction: see all space contracted around the scene's box into a ball of radius 2; None: as the scene's
-            space. Otherwise positions enter as they are, as in the paper.
+        density_noise: standard deviation of the Gaussian noise added to the raw density in training.
+        xavier: Glorot uniform weights and zero biases, as in Keras; False: PyTorch's own initialization.
+        contraction: contract all space around the scene's box into a ball of radius 2; None: as the scene's space.
+            Otherwise positions enter unchanged, as in the paper.
     """
 
     aabb: Tensor
@@ -96,11 +96,11 @@ class NerfMLP(Field):
         require_box(self.aabb)
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], None]:
-        """Return the density per unit length, without paying for colour."""
+        """Return the density per unit length, without paying for color."""
         return self._activate(_exactly(self.density_head, self._trunk(points.positions))[..., 0], None), None
 
     def forward(self, points: Points, features: Tensor | None = None) -> FieldOutput:
-        """Return density and colour; density does not depend on the direction. There are no features."""
+        """Return density and color; density does not depend on the direction. There are no features."""
         hidden = self._trunk(points.positions)
         raw_density = _exactly(self.density_head, hidden)[..., 0]
         feature = self.color_feature(hidden, points)
@@ -114,11 +114,11 @@ class NerfMLP(Field):
         return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
 
     def color_feature(self, hidden: Float[Tensor, "*points width"], points: Points) -> Float[Tensor, "*points width"]:
-        """Return what the colour is made of besides the direction; a field that follows this one may add to it."""
+        """Return what the color is made of besides the direction; a field that follows this one may add to it."""
         return self.feature(hidden)
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the layers of the trunk, the feature and the colour's; encodings that join them stand behind them."""
+        """Return the layers of the trunk, the feature and the color's; encodings that join them stand behind them."""
         following = ((f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk)))
         readers = (*following, ("density_head.weight", "feature.weight"))
         trunk = [HiddenLayer(self._rows(f"trunk.{number}"), each) for number, each in enumerate(readers)]
@@ -171,7 +171,7 @@ class NerfMLP(Field):
 
 
 def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
-    # With so few outputs float32 costs nothing, and a density or a colour keeps the digits that it has.
+    # With so few outputs float32 costs nothing, and a density or a color keeps the digits that it has.
     return linear(features, head.weight, head.bias, "float32")
 
 

@@ -27,7 +27,7 @@ THICK, THIN = 3.0, -1.0
 
 
 class NGPField(Field):
-    """Density from one hidden layer, colour from more that see the direction; exponential density.
+    """Density from one hidden layer, color from more that see the direction; exponential density.
 
     Positions are mapped from the scene's box, or from contracted space, to the unit cube. Outside of the box (without
     contraction) there is nothing.
@@ -36,15 +36,15 @@ class NGPField(Field):
         position_encoder: features of points in the unit cube.
         direction_encoder: features of unit directions.
         width: width of every hidden layer.
-        feature_dim: what the density's MLP hands to the colour's, the raw density included.
-        color_layers: hidden layers of the colour's MLP. Two as in arXiv 2201.05989; one is a tenth quicker, as sharp
-            after a minute of training on two cores, and less so after many.
-        density_bias: added to the raw density, before the exponential. None: thick (3) where the photographs have
-            alpha, which tells at once where nothing is, and thin (-1) where they have none: there a dense start would
-            remain as fog of the background's colour.
-        contraction: map all space, contracted around the box, instead of the box alone; None: as the scene's space.
-        appearance: numbers of a code that each photograph has, and that its colours depend on (Sec. 4.1, arXiv
-            2008.02268); 0: none. What is seen without a photograph has the mean code of those that train.
+        feature_dim: outputs of the density MLP that the color MLP receives, including the raw density.
+        color_layers: hidden layers of the color MLP. Two as in arXiv 2201.05989; one is a tenth faster, as sharp after
+            a minute of training on two cores, and less sharp after many.
+        density_bias: added to the raw density before the exponential. None: dense (3) if the photographs have alpha,
+            which shows early what is empty, and thin (-1) otherwise, because a dense start would remain as fog in the
+            background's color.
+        contraction: map all space, contracted around the box, instead of only the box; None: as the scene's space.
+        appearance: size of the appearance embedding of each photograph (Sec. 4.1, arXiv 2008.02268); 0: none. New views
+            use the mean embedding of the training photographs.
     """
 
     compiles = False
@@ -103,7 +103,7 @@ class NGPField(Field):
         if self.appearance:
             if len(scene.splits["train"]) < 2:
                 raise InputError(
-                    f"The scene {scene.name} trains on one photograph, and codes learn how the colours of several "
+                    f"The scene {scene.name} trains on one photograph, and codes learn how the colors of several "
                     "differ: add field.appearance=0, or give more photographs."
                 )
             self.codes = nn.Parameter(torch.zeros(len(scene.view_names), self.appearance))
@@ -129,7 +129,7 @@ class NGPField(Field):
         return self._density(self._through(self.density_mlp, encoded), points.positions), encoded
 
     def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
-        """Return density and colour; density does not depend on the direction."""
+        """Return density and color; density does not depend on the direction."""
         hidden = self._through(self.density_mlp, self._encoded(points, features))
         raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
@@ -138,7 +138,7 @@ class NGPField(Field):
         return FieldOutput(density=density, rgb=rgb)
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the one layer of the density's MLP, and those of the colour's."""
+        """Return the one layer of the density's MLP, and those of the color's."""
         sizes = {"density_mlp": len(self.density_mlp), "color_mlp": len(self.color_mlp)}
         return [
             HiddenLayer((f"{name}.{number}",), (f"{name}.{number + 1}",))
@@ -183,7 +183,7 @@ class NGPField(Field):
             nn.init.zeros_(self.codes)
 
     def _with_direction(self, features: Tensor, points: Points) -> Tensor:
-        """Return what the colour is made of: what the density's MLP hands over, the direction, and the code."""
+        """Return what the color is made of: what the density's MLP hands over, the direction, and the code."""
         shared = self._shared_along(points).to(features.dtype)
         return torch.cat([features, shared.expand(*features.shape[:-1], shared.shape[-1])], dim=-1)
 

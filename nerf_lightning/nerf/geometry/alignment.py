@@ -8,15 +8,15 @@ from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LEAST_SPREAD = 1e-6
-"""Of the cameras' centres, as a share of their distance from the origin; below it they stand in one place."""
+"""Of the cameras' centers, as a share of their distance from the origin; below it they stand in one place."""
 
 
 @disable_autocast
 def similarity_between(one: Float[Tensor, "views 3 4"], other: Float[Tensor, "views 3 4"]) -> Float[Tensor, "4 4"]:
     """Return the similarity that takes the poses of `one` to those of `other`, by least squares, in float64.
 
-    Umeyama's solution (PAMI 1991, Eq. 40-43), in which the cameras' axes count beside their centres, as much as the
-    centres' spread: cameras that stand in a line, or two of them, leave no turn about that line open.
+    Umeyama's solution (PAMI 1991, Eq. 40-43), in which the cameras' axes count beside their centers, as much as the
+    centers' spread: cameras that stand in a line, or two of them, leave no turn about that line open.
     """
     one, other = one.double(), other.double()
     middle, goal = one[:, :, 3].mean(dim=0), other[:, :, 3].mean(dim=0)

@@ -30,7 +30,7 @@ def to_unit_cube(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3
 
 
 def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return a box's centre and half of its sides.
+    """Return a box's center and half of its sides.
 
     >>> center_and_half(torch.tensor([[-1.0, 0, 2], [3, 1, 2]]))
     (tensor([1.0000, 0.5000, 2.0000]), tensor([2.0000, 0.5000, 0.0000]))

@@ -1,6 +1,6 @@
 """Cameras and their rays: pixels to rays, rays to pixels, focal lengths that follow the image's size.
 
-Letters: `c2w` camera-to-world, columns right, up, back, centre. A camera looks along -z; pixel centres lie at +0.5.
+Letters: `c2w` camera-to-world, columns right, up, back, center. A camera looks along -z; pixel centers lie at +0.5.
 `plane` is a place in the image in focal lengths from the principal point, y down: ((x - cx) / fx, (y - cy) / fy).
 """
 
@@ -39,7 +39,7 @@ def focal_from_fov(width: int | float, fov: float) -> float:
 
 
 def pinhole_cameras(c2w: Float[Tensor, "views 3 4"], focal: float, width: int, height: int) -> Cameras:
-    """Return cameras without a lens that share one focal length (pixels) and one size, centred on the image."""
+    """Return cameras without a lens that share one focal length (pixels) and one size, centered on the image."""
     views = c2w.shape[0]
     return Cameras(
         c2w=c2w,
@@ -81,14 +81,14 @@ def rays_through_pixels(
 
     The direction in camera axes is ((x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -1), undistorted by the lens where the
     camera has one, rotated into the world and brought to unit length. Where the cameras say so, the ray is then bent
-    into normalised device coordinates, and near and far with it.
+    into normalized device coordinates, and near and far with it.
 
     Args:
         cameras: one per view.
         pixels: which.
         near: where the rays of each view begin.
         far: where they end.
-        subpixel_offset: from the centre of its pixel to where each ray passes, in pixels (x, y); None: none.
+        subpixel_offset: from the center of its pixel to where each ray passes, in pixels (x, y); None: none.
         per_side: so many rays share each side of a pixel.
     """
     view = pixels.view

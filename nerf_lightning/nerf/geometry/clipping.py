@@ -66,7 +66,7 @@ class Clip:
         """Return the rays cut; where nothing is left of a ray, it ends where it begins.
 
         Args:
-            rays: as the model takes them, through the world or through normalised device coordinates.
+            rays: as the model takes them, through the world or through normalized device coordinates.
             straight: the same rays through the world.
             ndc: whether the two differ.
         """

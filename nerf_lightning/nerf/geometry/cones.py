@@ -24,13 +24,13 @@ def pixel_side(
     """Return the side of pixels at distance 0, and by how much it grows per unit of distance: the root of their areas.
 
     A pinhole's pixel takes the solid angle cos^3 / (f_x f_y); a lens that stretches its surroundings shows less in it.
-    In normalised device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
+    In normalized device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
     Without gradients: the size of its pixels is no reason to move a camera.
 
     Args:
         cameras: all views.
         view: of each pixel.
-        directions: of the pixels' centres in the lens's axes (right, down, forward), of any length.
+        directions: of the pixels' centers in the lens's axes (right, down, forward), of any length.
     """
     pixel = 1.0 / cameras.focal[view]
     if cameras.ndc is not None:

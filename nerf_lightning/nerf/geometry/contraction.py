@@ -57,7 +57,7 @@ def in_unit_ball(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3
 
 
 def contract(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-    """Bring all space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
+    """Bring all space into the ball of radius 2: x inside the unit ball, `(2 - 1/|x|) x/|x|` outside.
 
     Eq. 10 of arXiv 2111.12077.
 

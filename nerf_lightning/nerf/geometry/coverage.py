@@ -22,6 +22,6 @@ def middle_of(scene: SceneRecord) -> Float[Tensor, "3"]:
 
 
 def directions_seen(scene: SceneRecord) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
-    """Return azimuth (from x towards y) and elevation in degrees of each camera, as seen from the middle."""
+    """Return azimuth (from x toward y) and elevation in degrees of each camera, as seen from the middle."""
     x, y, z = (scene.cameras.c2w[:, :, 3] - middle_of(scene)).unbind(dim=-1)
     return torch.atan2(y, x).rad2deg(), torch.atan2(z, (x.square() + y.square()).sqrt()).rad2deg()

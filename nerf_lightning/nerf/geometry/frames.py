@@ -176,7 +176,7 @@ def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
 def told_length(record: SceneRecord) -> tuple[float, str]:
     """Return what makes a length of the scene's frame one that people are told, and its unit.
 
-    Metres, where the capture's unit is known to be some of them; else the capture's own units.
+    Meters, where the capture's unit is known to be some of them; else the capture's own units.
     """
     unit = unit_of(record.to_user.double())
     if record.metres_per_unit is None:

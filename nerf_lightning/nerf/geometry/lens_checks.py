@@ -1,4 +1,4 @@
-"""Which lenses can be inverted over their whole image; the others are refused before anything is learnt."""
+"""Which lenses can be inverted over their whole image; the others are refused before anything is learned."""
 
 from collections.abc import Sequence
 

@@ -22,7 +22,7 @@ ON_AXIS = 1e-12
 
 
 def with_coefficients(model: LensModel) -> LensModel:
-    """Return the model that a camera has once coefficients are learnt: a pinhole is a lens that bends nothing."""
+    """Return the model that a camera has once coefficients are learned: a pinhole is a lens that bends nothing."""
     return "radial_tangential" if model == "pinhole" else model
 
 

@@ -1,4 +1,4 @@
-"""Normalised device coordinates for forward-facing captures (Appendix C, arXiv 2003.08934).
+"""Normalized device coordinates for forward-facing captures (Appendix C, arXiv 2003.08934).
 
 The frustum in front of the near plane z = -1 becomes the cube from -1 to 1: straight lines stay straight, the far end
 of the world becomes z = 1, and equal steps along a ray are equal steps of disparity.

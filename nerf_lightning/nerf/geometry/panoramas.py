@@ -50,7 +50,7 @@ def panorama_footprint(
     Args:
         cameras: all views.
         view: which of them.
-        directions: of the spheres' centres from the camera, in the lens's axes, scene units.
+        directions: of the spheres' centers from the camera, in the lens's axes, scene units.
         half_diagonal: the spheres' radius in scene units.
     """
     distance = directions.norm(dim=-1)

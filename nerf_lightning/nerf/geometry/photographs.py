@@ -20,11 +20,11 @@ def photographs_of(scene: Scene, views: Sequence[int]) -> Photographs:
         views: numbers of the photographs that may be looked at; the trained ones, as a rule.
 
     Raises:
-        InputError: rays would run through normalised device coordinates, where no photograph was taken.
+        InputError: rays would run through normalized device coordinates, where no photograph was taken.
     """
     if scene.cameras.ndc is not None:
         raise InputError(
-            f"The scene {scene.name} was read in normalised device coordinates, but a model that looks at photographs "
+            f"The scene {scene.name} was read in normalized device coordinates, but a model that looks at photographs "
             "sends its rays through the world: add scene.space=contracted."
         )
     numbers = torch.tensor(views, dtype=torch.int64)

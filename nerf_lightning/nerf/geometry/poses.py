@@ -1,4 +1,4 @@
-"""Camera poses: checks and constructions. Poses are camera-to-world with columns right, up, back, centre."""
+"""Camera poses: checks and constructions. Poses are camera-to-world with columns right, up, back, center."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,7 +9,7 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 @disable_autocast
 def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
-    """Tell which poses are a rotation (orthonormal, determinant +1) and a finite centre."""
+    """Tell which poses are a rotation (orthonormal, determinant +1) and a finite center."""
     rotation = c2w[..., :3]
     identity = torch.eye(3, dtype=c2w.dtype, device=c2w.device)
     off = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))
@@ -90,7 +90,7 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Ten
 def look_at(
     eye: Float[Tensor, "*views 3"], target: Float[Tensor, "*views 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*views 3 4"]:
-    """Return cameras at `eye` that look at `target` with the picture's top towards `up`.
+    """Return cameras at `eye` that look at `target` with the picture's top toward `up`.
 
     >>> eye, target, up = torch.tensor([0.0, -4, 0]), torch.zeros(3), torch.tensor([0.0, 0, 1])
     >>> look_at(eye, target, up)[:, 2].tolist()  # the back axis points from the target to the eye

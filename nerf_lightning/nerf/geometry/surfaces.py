@@ -34,13 +34,13 @@ def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor,
     """Return unit normals, facing the camera, of a surface given as each pixel's point (world axes).
 
     Each pixel has those of a plane through the 5 x 5 pixels around it, by weighted least squares; zero where they lie
-    on a line. Differences of neighbours alone show the depth's waves, whose length is a cell of the field's, and go
-    wrong wherever a neighbour sees another surface. So near pixels count more (a Gaussian), and those whose points are
-    as far apart as a surface's are: s pixels away, s times as far as the second nearest of the four neighbours,
+    on a line. Differences of neighbors alone show the depth's waves, whose length is a cell of the field's, and go
+    wrong wherever a neighbor sees another surface. So near pixels count more (a Gaussian), and those whose points are
+    as far apart as a surface's are: s pixels away, s times as far as the second nearest of the four neighbors,
 
         w = exp(-s^2 / (2 sigma^2)) exp(-((|p_k - p| - s gap) / gap)^2).
 
-    With row 0 on top, (slope down the rows) x (slope along the columns) points towards the camera for whatever a
+    With row 0 on top, (slope down the rows) x (slope along the columns) points toward the camera for whatever a
     pinhole sees, so no pose is needed. The picture must be at least two pixels high and wide.
     """
     normals, height = torch.empty_like(points), points.shape[0]

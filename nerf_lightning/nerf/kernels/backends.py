@@ -252,7 +252,7 @@ def _warn_once(library: str, reason: str) -> None:
             "Ubuntu: apt install gcc python3-dev)."
         )
     log.warning(
-        "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. %s",
+        "%s cannot be used here (%s): PyTorch versions of its kernels run instead, many times slower. %s",
         library,
         reason,
         cure,

@@ -28,7 +28,7 @@ class Loss(Part, ABC):
 
     @abstractmethod
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
-        """Return named terms, each with a number per level; training minimises the sum of all, and logs each.
+        """Return named terms, each with a number per level; training minimizes the sum of all, and logs each.
 
         Args:
             renderings: one per level.
@@ -51,4 +51,4 @@ class Loss(Part, ABC):
         return []
 
     def forget(self) -> None:
-        """Forget what was learnt, for a new attempt."""
+        """Forget what was learned, for a new attempt."""

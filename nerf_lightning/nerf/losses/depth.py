@@ -22,8 +22,8 @@ class DepthLoss(Loss):
     again in other photographs, or that a depth sensor measured (`Scene.depths`).
 
     Args:
-        every: one of so many rays of a step runs through such a pixel; its colour counts like any other.
-        fade: factor that the term has shrunk to at the end of the run, exponentially: colours know better by then.
+        every: one in this many rays of a step passes through such a pixel; its color is trained like any other.
+        fade: factor to which the term decays exponentially by the end of the run, when colors are more accurate.
 
     Raises:
         ValueError: a number out of its range.
@@ -63,7 +63,7 @@ def distance_error(
 ) -> Float[Tensor, "rays"]:
     """Return sum_i w_i min(1, |log(z_i / z)|) of each ray, where z_i / z is the ratio of depths of t_i and `distance`.
 
-    In normalised device coordinates the depth at t is z_near / (1 - t / infinity) (`ndc.world_distance`).
+    In normalized device coordinates the depth at t is z_near / (1 - t / infinity) (`ndc.world_distance`).
     """
     t = rendering.samples.midpoints
     if isinstance(rendering, RaggedRendering):

@@ -11,7 +11,7 @@ from nerf_lightning.nerf.types.renderings import Rendering
 
 
 class MeanSquaredError(Loss):
-    """Mean squared error of the colour, every level alike, so that the coarse level learns where to look."""
+    """Mean squared error of the color, every level alike, so that the coarse level learns where to look."""
 
     def forward(self, renderings: list[Rendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return the weighted mean over rays and channels, per level."""
@@ -19,5 +19,5 @@ class MeanSquaredError(Loss):
 
 
 def squared_error(rgb: Float[Tensor, "rays 3"], target: Target) -> Float[Tensor, ""]:
-    """Return the mean squared error of colours, weighted over rays, over rays and channels."""
+    """Return the mean squared error of colors, weighted over rays, over rays and channels."""
     return (mse_loss(rgb, target.rgb, reduction="none") * target.weight[..., None]).mean()

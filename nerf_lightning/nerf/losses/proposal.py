@@ -1,4 +1,4 @@
-"""The losses of mip-NeRF 360 (arXiv 2111.12077): colour, proposals that bound the truth, and compact weights.
+"""The losses of mip-NeRF 360 (arXiv 2111.12077): color, proposals that bound the truth, and compact weights.
 
 Letters: edges t, weights w of the last level; edges u, weights v of a proposal.
 """
@@ -21,12 +21,12 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 class ProposalLoss(Loss):
     """Mean squared error of the last level, the interlevel loss of each proposal, and a distortion loss.
 
-    Eq. 13 and 15 of arXiv 2111.12077; colour is compared by the squared error of arXiv 2003.08934 (Eq. 6) instead of
+    Eq. 13 and 15 of arXiv 2111.12077; color is compared by the squared error of arXiv 2003.08934 (Eq. 6) instead of
     the Charbonnier loss.
 
     Args:
-        interlevel: factor on the interlevel losses; the proposals learn from nothing else, so it hardly matters.
-        distortion: factor on the distortion loss; larger values remove fog and floaters, too large ones detail.
+        interlevel: factor on the interlevel losses; it hardly matters, because proposals learn from nothing else.
+        distortion: factor on the distortion loss; larger values remove fog and floaters, and too large ones detail.
     """
 
     needs_weights = True
@@ -36,7 +36,7 @@ class ProposalLoss(Loss):
         self.interlevel, self.distortion = interlevel, distortion
 
     def forward(self, renderings: list[DenseRendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
-        """Return weighted means over rays: interlevel of each proposal, colour and distortion of the last level."""
+        """Return weighted means over rays: interlevel of each proposal, color and distortion of the last level."""
         last, weight = renderings[-1], target.weight
         none = torch.zeros_like(last.depth[0])
         bounds = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
@@ -69,7 +69,7 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
 def outer_weights(
     t: Float[Tensor, "*rays inner"], u: Float[Tensor, "*rays outer"], v: Float[Tensor, "*rays bins"]
 ) -> Float[Tensor, "*rays intervals"]:
-    """Return, for each interval between neighbours of t, the weight of all intervals of u that it touches.
+    """Return, for each interval between neighbors of t, the weight of all intervals of u that it touches.
 
     >>> outer_weights(torch.tensor([0.5, 1.5, 1.75]), torch.tensor([0.0, 1, 2, 3]), torch.tensor([0.1, 0.2, 0.4]))
     tensor([0.3000, 0.2000])

@@ -17,18 +17,18 @@ from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.rays import Target
 
 LEAST_NEAR, LEAST_AROUND = 0.5, 0.6
-"""Shares of good pixels from which on a pixel is kept for its neighbours' sake: in 3 x 3, and in the whole square."""
+"""Shares of good pixels from which on a pixel is kept for its neighbors' sake: in 3 x 3, and in the whole square."""
 MEMORY = 0.9
 """Of the threshold, what is left of it after a step; a single batch may show hardly anything but people."""
 FIRST_THRESHOLD = 1.0
-"""No colour in [0, 1] is farther off than that: at first nothing is left out."""
+"""No color in [0, 1] is farther off than that: at first nothing is left out."""
 RANGES = {"share": (0.01, 1.0), "times": (0.1, 1000.0), "patch": (4, 256)}
 
 
 class RobustLoss(Loss):
     """Leave the pixels that the scene does not explain out of another loss.
 
-    The threshold is learnt: a multiple of a quantile of the last picture's residuals, averaged over the steps. Rays
+    The threshold is learned: a multiple of a quantile of the last picture's residuals, averaged over the steps. Rays
     come in squares of pixels; those beyond the last whole square are all kept.
 
     The paper's threshold is the median itself, which keeps detail away for the hundred thousands of steps that it
@@ -36,11 +36,11 @@ class RobustLoss(Loss):
     below at any time, and steps that see more places.
 
     Args:
-        of: the loss that the others count in, for all its levels.
-        share: least share of the pixels that surely show the scene. Less trims more: passers-by faster, fine detail
-            later. It must exceed the share of a plain background, whose residuals are 0 and say nothing of the scene.
-        times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
-        patch: side of the squares in pixels.
+        of: the loss of the remaining pixels, for all levels.
+        share: the minimum share of pixels that show the static scene. A smaller share trims more: passers-by sooner,
+            fine detail later. It must exceed the share of a plain background, whose residuals are 0.
+        times: the threshold, in units of that quantile (of squared errors: 4 is twice the distance of colors).
+        patch: side of the patches in pixels.
 
     Raises:
         ValueError: a number out of its range.
@@ -59,7 +59,7 @@ class RobustLoss(Loss):
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return what the other loss does for the rays that are kept; the others weigh 0."""
         error = residuals(renderings[-1].rgb.detach(), target.rgb)
-        # What a mask leaves out speaks against no neighbour.
+        # What a mask leaves out speaks against no neighbor.
         kept = kept_pixels((error <= self.threshold) | (target.weight == 0), self.patch)
         return self.of(renderings, replace(target, weight=target.weight * kept))
 
@@ -67,7 +67,7 @@ class RobustLoss(Loss):
     def learn(
         self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
     ) -> None:
-        """Move the threshold towards that of a step's residuals; masked pixels have none."""
+        """Move the threshold toward that of a step's residuals; masked pixels have none."""
         known = torch.where(weight > 0, residuals(rgb, target), torch.nan)
         wanted = self.times * torch.nanquantile(known, float(self.share))
         moved = MEMORY * self.threshold + (1.0 - MEMORY) * wanted
@@ -83,14 +83,14 @@ class RobustLoss(Loss):
 
 
 def residuals(rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays"]:
-    """Return the mean squared error of each ray's colour."""
+    """Return the mean squared error of each ray's color."""
     return (rgb - target).square().mean(dim=-1)
 
 
 def kept_pixels(good: Bool[Tensor, "rays"], patch: int) -> Bool[Tensor, "rays"]:
     """Return which pixels are trained on: the good ones, and others that most of their surroundings vouch for.
 
-    Eq. 8 to 10 of arXiv 2302.00833: a pixel is kept where it is good, or at least half of its neighbours of 3 x 3 are
+    Eq. 8 to 10 of arXiv 2302.00833: a pixel is kept where it is good, or at least half of its neighbors of 3 x 3 are
     (those within the square), or it lies in the inner half of a square (8 x 8 of 16 x 16) of which 60 % are kept so.
 
     Args:

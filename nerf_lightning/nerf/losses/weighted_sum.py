@@ -13,7 +13,7 @@ class WeightedSum(Loss):
     """Add up named losses.
 
     Args:
-        terms: name -> loss. Those that look at squares of pixels must look at squares of one size.
+        terms: name -> loss. Losses on patches of pixels must agree on their size.
         weights: name -> factor; 1 for a loss that is not named.
 
     Raises:

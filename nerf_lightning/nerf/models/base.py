@@ -65,7 +65,7 @@ class Model(nn.Module, ABC):
 
         Args:
             rays: unit directions, scene units.
-            background: colour behind each ray; None closes the ray.
+            background: color behind each ray; None closes the ray.
             random: the step's numbers for these rays; None for evaluation.
         """
 
@@ -95,7 +95,7 @@ class Model(nn.Module, ABC):
 
     @abstractmethod
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
+        """Draw every parameter anew from torch's generator, and forget what was learned otherwise."""
 
     @abstractmethod
     def set_precision(self, matmul_precision: MatmulPrecision) -> None:
@@ -132,7 +132,7 @@ class Model(nn.Module, ABC):
 
 
 class PointField(Model):
-    """A model of one scene, which has density and colour at points by themselves: exporters ask it for both."""
+    """A model of one scene, which has density and color at points by themselves: exporters ask it for both."""
 
     @abstractmethod
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
@@ -144,7 +144,7 @@ class PointField(Model):
 
 
 def point_field(model: Model) -> PointField:
-    """Return a model that has density and colour at points.
+    """Return a model that has density and color at points.
 
     Raises:
         InputError: it renders rays alone.
@@ -152,9 +152,8 @@ def point_field(model: Model) -> PointField:
     if isinstance(model, PointField):
         return model
     raise InputError(
-        f"{type(model).__name__} renders rays and has neither density nor colour at points, so there is nothing to "
-        "make a mesh, points, a volume or a page of. nerf render films it; for the others train a model of the scene, "
-        "such as model=fast."
+        f"{type(model).__name__} renders rays and has neither density nor color at points, so neither surfaces nor "
+        "volumes can be exported. nerf render films it; for the others train a model of the scene, such as model=fast."
     )
 
 

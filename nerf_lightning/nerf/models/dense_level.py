@@ -25,10 +25,10 @@ class DenseLevel(Level):
 
     Args:
         sampler: where the field is asked.
-        field: density and colour.
-        gradient_scaling_distance: from here on (scene units) gradients are whole, nearer to the camera they are
-            smaller, against floaters (`soften_near_gradients`); 0: whole everywhere, as where rays are normalised
-            device coordinates, in which no distance is one.
+        field: density and color.
+        gradient_scaling_distance: distance from the camera (scene units) within which gradients are scaled down,
+            against floaters (`soften_near_gradients`); 0: nowhere, as in normalized device coordinates, which have no
+            such distance.
     """
 
     sampler: DenseSampler
@@ -51,7 +51,7 @@ class DenseLevel(Level):
             self.gradient_scaling_distance = 0.0
 
     def compile_field(self) -> bool:
-        """Compile the field, for static shapes: dynamic ones may be specialised otherwise after a resume."""
+        """Compile the field, for static shapes: dynamic ones may be specialized otherwise after a resume."""
         if self.field.compiles:
             self.field.compile(dynamic=False)
         return self.field.compiles

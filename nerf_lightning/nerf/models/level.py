@@ -22,7 +22,7 @@ class Level(nn.Module):
 
     Args:
         sampler: where the field is asked.
-        field: density and colour.
+        field: density and color.
     """
 
     sampler: Sampler
@@ -110,7 +110,7 @@ class Level(nn.Module):
         """Forget what was counted while rendering."""
 
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
+        """Draw every parameter anew from torch's generator, and forget what was learned otherwise."""
         self.field.reset_parameters()
         self.sampler.reset()
         self.reset_statistics()

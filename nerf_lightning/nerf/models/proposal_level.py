@@ -1,4 +1,4 @@
-"""A level that only proposes where to look: density without colour."""
+"""A level that only proposes where to look: density without color."""
 
 from dataclasses import replace
 
@@ -26,10 +26,10 @@ class ProposalLevel(DenseLevel):
     Args:
         sampler: where the field is asked.
         field: its density is all that is used.
-        learn_every: steps from one in which it learns to the next.
+        learn_every: the proposal is trained in one of this many steps.
         learn_always: so many steps at first, it learns in each.
-        gradient_scaling_distance: from here on (scene units) gradients are whole, nearer to the camera they are
-            smaller, against floaters; 0: whole everywhere, as in `DenseLevel`.
+        gradient_scaling_distance: distance from the camera (scene units) within which gradients are scaled down,
+            against floaters; 0: nowhere, as in `DenseLevel`.
     """
 
     has_color = False
@@ -69,7 +69,7 @@ class ProposalLevel(DenseLevel):
             return super().forward(rays, background, history, random)
 
     def field_parts(self) -> FieldParts | None:
-        """Return the field's, without colours."""
+        """Return the field's, without colors."""
         parts = self.field.parts()
         return None if parts is None else replace(parts, color_weights=[])
 

@@ -23,9 +23,9 @@ class RadianceModel(PointField):
 
     Args:
         levels: name -> level, in order.
-        subpixels: rays along each side of a pixel, whose mean is compared with its photograph, in the last part of the
-            run, and in pictures; 1: one ray through the centre.
-        subpixels_from: share of the run before that part.
+        subpixels: rays along each side of a pixel, whose mean is compared with the photograph in the last part of the
+            run and in renders; 1: one ray through the center.
+        subpixels_from: share of the run at which that part begins.
     """
 
     def __init__(self, levels: dict[str, Level], subpixels: int = 1, subpixels_from: float = 0.8):
@@ -83,7 +83,7 @@ class RadianceModel(PointField):
         return self.last.density(positions)
 
     def query(self, points: Points) -> FieldOutput:
-        """Return density and colour of points by themselves, as the last level's field has them."""
+        """Return density and color of points by themselves, as the last level's field has them."""
         return self.last.field(points)
 
     def forward(
@@ -96,7 +96,7 @@ class RadianceModel(PointField):
 
         Args:
             rays: unit directions, scene units.
-            background: colour behind each ray; None closes the ray.
+            background: color behind each ray; None closes the ray.
             random: the step's numbers for these rays; None for evaluation.
         """
         history: list[Rendering] = []

@@ -100,7 +100,7 @@ class RaggedLevel(Level):
     ) -> Rendering | None:
         matmul_precision, sampler = self.field.matmul_precision, self.sampler
         trains = torch.is_grad_enabled()
-        # Learnt focal lengths and lenses turn directions alone.
+        # Learned focal lengths and lenses turn directions alone.
         moved = any(each.requires_grad for each in (rays.origins, rays.directions, rays.view_directions))
         parts = self._parts_on(rays.near.device, trains, moved) if evaluates or trains else None
         if parts is None:

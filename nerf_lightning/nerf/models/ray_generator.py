@@ -23,7 +23,7 @@ MOVED = ("c2w", "focal", "center", "lens", "width", "height", "ndc")
 class RayGenerator(Part):
     """Make the rays through pixels of views, on the device that it was moved to.
 
-    It is a module so that cameras may be learnt: they are a function of the parameters of its refinement. What it is
+    It is a module so that cameras may be learned: they are a function of the parameters of its refinement. What it is
     given is data, and stands in no checkpoint's weights.
 
     Args:
@@ -73,22 +73,22 @@ class RayGenerator(Part):
 
     @property
     def cameras(self) -> Cameras:
-        """The cameras that rays start from, as they have been learnt so far."""
+        """The cameras that rays start from, as they have been learned so far."""
         return self.refinement(self.given)
 
     @property
     def given(self) -> Cameras:
-        """The cameras as they were before anything was learnt."""
+        """The cameras as they were before anything was learned."""
         return Cameras(lens_model=self.lens_model, **{name: getattr(self, name) for name in MOVED})
 
     def forward(
         self, pixels: PixelIndex, subpixel_offset: Float[Tensor, "*#rays 2"] | None = None, per_side: int = 1
     ) -> RayBundle:
-        """Return the rays through pixels, in the world or in normalised device coordinates.
+        """Return the rays through pixels, in the world or in normalized device coordinates.
 
         Args:
             pixels: which.
-            subpixel_offset: from the centre of its pixel to where each ray passes, in pixels (x, y); None: none.
+            subpixel_offset: from the center of its pixel to where each ray passes, in pixels (x, y); None: none.
             per_side: so many rays share each side of a pixel.
         """
         rays = rays_through_pixels(self.cameras, pixels, self.near, self.far, subpixel_offset, per_side)
@@ -109,7 +109,7 @@ class RayGenerator(Part):
         self.refinement.reset_parameters()
 
     def refined(self, trained: Sequence[int]) -> Cameras | None:
-        """Return the cameras as learnt, the others aligned with them, on the CPU; None where none learns.
+        """Return the cameras as learned, the others aligned with them, on the CPU; None where none learns.
 
         Args:
             trained: numbers of the views that are trained on.
@@ -125,7 +125,7 @@ class RayGenerator(Part):
     ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"] | None]:
         """Return where along the rays of `forward` points lie that have a distance in the world, and where those end.
 
-        The end is that of normalised device coordinates, which is infinitely far away; else None.
+        The end is that of normalized device coordinates, which is infinitely far away; else None.
         """
         if self.ndc is None:
             return distance, None

@@ -63,7 +63,7 @@ def render_picture(
         background: what lies behind the scene.
         tile_points: most points that go through a field at once.
         clip: what of the scene is shown; None: all.
-        seen_from: other cameras, from whose directions the colour is looked up, in place of the view's own.
+        seen_from: other cameras, from whose directions the color is looked up, in place of the view's own.
     """
     cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
 
@@ -108,7 +108,7 @@ def view_rays(
         rays_of: the cameras.
         pixels: which.
         clip: what of the scene is shown; None: all.
-        subpixel_offset: from the centre of each pixel to where its ray passes, in pixels (x, y); None: none.
+        subpixel_offset: from the center of each pixel to where its ray passes, in pixels (x, y); None: none.
         per_side: so many rays share each side of a pixel.
     """
     subpixel_offset = None if subpixel_offset is None else subpixel_offset.to(pixels.x.device)
@@ -124,7 +124,7 @@ def picture_surface(
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width 3"]]:
     """Return the distance at which the light of each pixel was stopped, and where in the world that is; on the CPU.
 
-    In normalised device coordinates light that escapes has no distance that could be taken out.
+    In normalized device coordinates light that escapes has no distance that could be taken out.
 
     Args:
         rays_of: the cameras that the picture was rendered through.
@@ -173,7 +173,7 @@ def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slic
                 raise
         forget_workspaces()
         model.most_rays = at_once = at_once // 2
-        log.warning("no memory to render so many rays at once: from now on %d", at_once)
+        log.warning("out of memory: rendering %d rays at a time from now on", at_once)
 
 
 def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture]) -> Picture:

@@ -1,6 +1,6 @@
 """Several rays through each pixel, whose mean is what a photograph's pixel shows: the light of its area.
 
-One ray through the centre sees a point of that area. What is learnt so is blurred by a pixel, and not alike from every
+One ray through the center sees a point of that area. What is learned so is blurred by a pixel, and not alike from every
 side, so that other views are less sharp than those that taught it (Sec. 1, arXiv 2103.13415). The mean over a grid of
 rays is the plain cure; it costs as many times the samples, so it is for the end of a run.
 """
@@ -24,7 +24,7 @@ class Subpixels(Part):
     """How many rays go through each pixel now, along each of its sides.
 
     Args:
-        side: rays along each side in the last part of the run, and in pictures from then on; 1: one through the centre.
+        side: rays along each side in the last part of the run, and in pictures from then on; 1: one through the center.
         start: share of the run before that part; until then there is one.
     """
 
@@ -50,7 +50,7 @@ class Subpixels(Part):
         return self._now**2
 
     def offsets(self, device: torch.device | str = "cpu") -> Float[Tensor, "per_pixel 2"]:
-        """Return where in a pixel its rays go through, in pixels from its centre (x, y), row by row.
+        """Return where in a pixel its rays go through, in pixels from its center (x, y), row by row.
 
         >>> halves = Subpixels(2)
         >>> halves.on_step(StepContext(progress=0.9, step=9, key=0))
@@ -65,7 +65,7 @@ class Subpixels(Part):
         self._set(self.side if context.progress >= self.start else 1)
 
     def reset(self) -> None:
-        """Begin with one ray through each pixel's centre, for a new attempt."""
+        """Begin with one ray through each pixel's center, for a new attempt."""
         self._set(1)
 
     def validate_state(self) -> None:

@@ -47,6 +47,11 @@ def is_out_of_memory(error: RuntimeError) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
+def is_device_failure(error: BaseException) -> bool:
+    """Tell whether the GPU itself has failed: whatever lay on it is lost, and the process can no longer use it."""
+    return isinstance(error, torch.AcceleratorError) or str(error).startswith(("CUDA error", "Triton Error [CUDA]"))
+
+
 def weighted_renderings(
     model: Model, rays: RayBundle, background: Background, key: int, tile_points: int
 ) -> Iterator[tuple[RayBundle, list[DenseRendering | RaggedRendering]]]:

@@ -20,9 +20,9 @@ class ExponentialDecay(Schedule):
     The paper decays from 5e-4 to 5e-5 over the run; decay_rate=1 keeps the rate constant.
 
     Args:
-        decay_rate: what the learning rate is multiplied by after `decay_steps`.
-        decay_steps: steps over which the rate falls by that; None: the length of the run.
-        warmup_steps: steps of the linear rise.
+        decay_rate: the factor of the learning rate after `decay_steps`.
+        decay_steps: steps after which the rate has decayed by that factor; None: the length of the run.
+        warmup_steps: steps of the linear warm-up.
 
     >>> ExponentialDecay(decay_rate=0.1)(50, num_steps=100) == 0.1**0.5
     True
@@ -45,8 +45,8 @@ class Cooldown(Schedule):
     takes the noise out that it leaves.
 
     Args:
-        cooldown: share of the run, at its end, in which the rate falls.
-        warmup_steps: steps of the linear rise.
+        cooldown: share of the run, at its end, in which the rate decays.
+        warmup_steps: steps of the linear warm-up.
 
     >>> [Cooldown(cooldown=0.5)(step, num_steps=64) for step in (0, 32, 48, 64)]
     [1.0, 1.0, 0.5, 0.0]

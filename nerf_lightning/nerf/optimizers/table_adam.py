@@ -22,9 +22,9 @@ class TableAdam(Optimizer):
     Args:
         params: parameters or groups of them.
         lr: learning rate.
-        betas: decay of the two moments.
-        eps: added to the root of the second moment; tiny, since the gradients of rarely seen entries are.
-        weight_decay: added to the gradient, times the weight; the system gives tables a group with none.
+        betas: decay rates of the two moments.
+        eps: added to the root of the second moment; tiny, like the gradients of rarely seen entries.
+        weight_decay: L2 penalty on matrices; hash tables have none.
     """
 
     def __init__(

@@ -13,12 +13,12 @@ class Refinement(Part, ABC):
         """Take note of the cameras and of the scene's extent, once, before training.
 
         Raises:
-            InputError: a scene whose cameras cannot be learnt.
+            InputError: a scene whose cameras cannot be learned.
         """
 
     @abstractmethod
     def forward(self, cameras: Cameras) -> Cameras:
-        """Return the cameras as they have been learnt so far."""
+        """Return the cameras as they have been learned so far."""
 
     def moves(self) -> bool:
         """Tell whether there is anything to learn."""

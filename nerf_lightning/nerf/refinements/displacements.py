@@ -17,7 +17,7 @@ LEAST_FAR = 5e-3
 
 
 def align_untrained_cameras(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
-    """Return the cameras as learnt, and those that were not trained on where the trained ones have gone as a whole.
+    """Return the cameras as learned, and those that were not trained on where the trained ones have gone as a whole.
 
     Nothing in the photographs says where the scene is, how large, or turned how, so all trained cameras may have
     drifted alike: the others follow by the similarity between the trained ones before and after.

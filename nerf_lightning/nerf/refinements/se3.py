@@ -37,13 +37,12 @@ class SE3Delta(Refinement):
     them from drifting that way.
 
     Args:
-        poses: learn how each camera turns and shifts (w and t).
-        focal: learn the focal length of each camera (g).
-        lens: learn the radial coefficients of each camera's lens (h1 and h2).
-        learning_rate: of all of them, at the beginning; the run's schedule scales it.
-        hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
-            would only wander.
-        weight: factor on the penalty, the sum of the squares of all of these over the number of photographs.
+        poses: refine the rotation and translation of each camera (w and t).
+        focal: refine the focal length of each camera (g).
+        lens: refine the radial coefficients of each camera's lens (h1 and h2).
+        learning_rate: the initial learning rate of all of them; the run's schedule scales it.
+        hold: share of the run in which cameras are fixed: without a scene to align to, they would drift.
+        weight: weight of the penalty: the sum of squares of all of these, divided by the number of photographs.
     """
 
     extent: Tensor
@@ -75,12 +74,12 @@ class SE3Delta(Refinement):
         """Take note of the cameras and of the scene's extent, once, before training.
 
         Raises:
-            InputError: rays run through normalised device coordinates, there are too few photographs, or more of
-                panoramas than their poses is to be learnt.
+            InputError: rays run through normalized device coordinates, there are too few photographs, or more of
+                panoramas than their poses is to be learned.
         """
         if scene.cameras.ndc is not None:
             raise InputError(
-                f"refinement: the scene {scene.name} is trained in normalised device coordinates (scene.space=ndc), "
+                f"refinement: the scene {scene.name} is trained in normalized device coordinates (scene.space=ndc), "
                 "which bend all rays as one camera that looks straight ahead sees them, so a camera that turns would "
                 "no longer fit the others. Train with scene.space=contracted, or with refinement=none."
             )
@@ -98,7 +97,7 @@ class SE3Delta(Refinement):
         self.learn(scene.cameras, scene.aabb, photographs)
 
     def learn(self, cameras: Cameras, aabb: Float[Tensor, "2 3"], photographs: int) -> None:
-        """Make room for what is learnt of some cameras; `photographs` of them are trained on, the box holds content."""
+        """Make room for what is learned of cameras; `photographs` of them are trained on, the box holds content."""
         views = len(cameras.width)
         extent = (aabb[1] - aabb[0]).norm() / 2.0
         ahead = -((aabb.mean(dim=0) - cameras.c2w[:, :, 3]) * cameras.c2w[:, :, 2]).sum(dim=1)
@@ -117,7 +116,7 @@ class SE3Delta(Refinement):
 
     @disable_autocast
     def forward(self, cameras: Cameras) -> Cameras:
-        """Return the cameras as they have been learnt so far."""
+        """Return the cameras as they have been learned so far."""
         if self.is_held:
             return cameras
         if self.poses:

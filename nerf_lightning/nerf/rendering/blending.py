@@ -11,7 +11,7 @@ from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.scene import DRAWN, UNSURE, Background, Scene
 
 LEAST_OPACITY = 1e-2
-"""Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less."""
+"""Of a ray whose color can be told from the background's: below it, divided by this, it counts for less."""
 
 
 def background_colors(
@@ -21,14 +21,14 @@ def background_colors(
     random: RayRandom | None,
     rgba: Float[Tensor, "rays 4"] | None = None,
 ) -> Float[Tensor, "rays 3"] | None:
-    """Return the colour behind each ray, or None where the ray is closed.
+    """Return the color behind each ray, or None where the ray is closed.
 
     Args:
         background: which; those that are drawn anew are so while training alone.
         num_rays: how many.
-        device: where the colours are wanted.
-        random: the step's numbers; None (evaluation, rendering) stands for the colour of evaluation.
-        rgba: the pixels that are trained on, of which `UNSURE` ones keep the colour of evaluation behind them.
+        device: where the colors are wanted.
+        random: the step's numbers; None (evaluation, rendering) stands for the color of evaluation.
+        rgba: the pixels that are trained on, of which `UNSURE` ones keep the color of evaluation behind them.
     """
     if background == "none":
         return None
@@ -53,9 +53,9 @@ def at_evaluation(background: Background) -> Background:
 
 
 def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] | None) -> Float[Tensor, "*rays 3"]:
-    """Return straight-alpha colours over a background: rgb * a + background * (1 - a).
+    """Return straight-alpha colors over a background: rgb * a + background * (1 - a).
 
-    Without a background the colours are taken as they are.
+    Without a background the colors are taken as they are.
 
     >>> blend(torch.tensor([1.0, 0.0, 0.0, 0.25]), torch.ones(3))
     tensor([1.0000, 0.7500, 0.7500])
@@ -72,12 +72,12 @@ def in_other_light(
     foreground: Float[Tensor, "*rays 3"],
     opacity: Float[Tensor, "*rays"],
 ) -> Float[Tensor, "*rays 3"]:
-    """Return rendered colours after a change of the scene's own light; the background behind it keeps its colour.
+    """Return rendered colors after a change of the scene's own light; the background behind it keeps its color.
 
     Args:
-        change: takes straight colours, as of opaque pixels, to changed ones.
+        change: takes straight colors, as of opaque pixels, to changed ones.
         rgb: over the background.
-        foreground: the scene's own light in them, sum of weights times colour.
+        foreground: the scene's own light in them, sum of weights times color.
         opacity: sum of weights.
     """
     opacity = opacity[..., None]

@@ -1,6 +1,6 @@
-"""Light that is scaled, in colours that are encoded for a screen (sRGB, IEC 61966-2-1).
+"""Light that is scaled, in colors that are encoded for a screen (sRGB, IEC 61966-2-1).
 
-Letters: encoded colour x, linear light v, gain g. v = x / 12.92 up to x = 0.04045, ((x + 0.055) / 1.055)^2.4 above.
+Letters: encoded color x, linear light v, gain g. v = x / 12.92 up to x = 0.04045, ((x + 0.055) / 1.055)^2.4 above.
 Both curves are used beyond [0, 1], too: the straight one below 0, the power above 1.
 """
 
@@ -11,8 +11,8 @@ from torch import Tensor
 KNEE, SLOPE, OFFSET, POWER = 0.04045, 12.92, 0.055, 2.4
 
 
-def to_linear(rgb: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
-    """Return the linear light of encoded colours, v(x).
+def to_linear(rgb: Float[Tensor, "*colors"]) -> Float[Tensor, "*colors"]:
+    """Return the linear light of encoded colors, v(x).
 
     >>> to_linear(torch.tensor([0.0, 0.5, 1.0]))
     tensor([0.0000, 0.2140, 1.0000])
@@ -22,11 +22,11 @@ def to_linear(rgb: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
     return torch.where(above, power, rgb / SLOPE)
 
 
-def scale_light(rgb: Float[Tensor, "*colours"], gain: Float[Tensor, "*#colours"]) -> Float[Tensor, "*colours"]:
-    """Return the encoded colours of g times the light of encoded colours, x(g v(x)).
+def scale_light(rgb: Float[Tensor, "*colors"], gain: Float[Tensor, "*#colors"]) -> Float[Tensor, "*colors"]:
+    """Return the encoded colors of g times the light of encoded colors, x(g v(x)).
 
-    Where both colours lie on the power's part that is s (x + 0.055) - 0.055 with s = g^(1/2.4), and where both lie on
-    the straight one g x: so written, a gain of 1 changes no bit, neither of the colours nor of their gradients.
+    Where both colors lie on the power's part that is s (x + 0.055) - 0.055 with s = g^(1/2.4), and where both lie on
+    the straight one g x: so written, a gain of 1 changes no bit, neither of the colors nor of their gradients.
 
     Args:
         rgb: encoded; in [0, 1], or beyond.

@@ -18,7 +18,7 @@ def soften_near_gradients(
     photograph as those farther away do from all: matter grows before a camera, which no other photograph contradicts.
 
     Args:
-        output: density and colour of samples.
+        output: density and color of samples.
         distance: from the camera, scene units.
         whole_from: from this distance on gradients are whole; 0: everywhere.
     """

@@ -49,10 +49,10 @@ def composite(
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
-        output: density and colour at the samples' midpoints.
+        output: density and color at the samples' midpoints.
         samples: the intervals.
         rays: where near and far stand.
-        background: colour behind each ray; None closes the ray instead.
+        background: color behind each ray; None closes the ray instead.
     """
     integrated = integrate_dense(output.density, output.rgb, samples.edges, closed=background is None)
     if integrated is not None and not output.channels:

@@ -20,10 +20,10 @@ def composite_ragged(
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
-        output: density and colour at the samples' midpoints.
+        output: density and color at the samples' midpoints.
         samples: the intervals.
         rays: where far stands.
-        background: colour behind each ray; None leaves the rays open in front of black.
+        background: color behind each ray; None leaves the rays open in front of black.
     """
     rendering = ragged_rendering(integrate(output.density, output.rgb, samples), samples, rays, background)
     weights = rendering.weights[:, None]

@@ -28,7 +28,7 @@ class Sampler(Part):
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
     def reset(self) -> None:
-        """Forget what was learnt of the scene while training."""
+        """Forget what was learned of the scene while training."""
 
     def update(self, density: DensityFn, step: int, key: int) -> None:
         """Learn from the field between steps of training.

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 
 # Samples of a ray in one chunk; more where few rays are left.
 CHUNK_SAMPLES, MOST_CHUNK_SAMPLES = 6, 64
-# In rendering, samples less opaque than this keep their density and lose their colour.
+# In rendering, samples less opaque than this keep their density and lose their color.
 LEAST_ALPHA = 1e-3
 
 
@@ -82,7 +82,7 @@ def _until_opaque(
 
 
 def _visible_colors(field: Field, rays: RayBundle, samples: RaggedSamples) -> FieldOutput:
-    # Most samples are all but transparent: their colour, which costs most, is not computed.
+    # Most samples are all but transparent: their color, which costs most, is not computed.
     points = ragged_points(rays, samples, None, field.sees_cones)
     density, features = field.density(points)
     if features is None:

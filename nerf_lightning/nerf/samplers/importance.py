@@ -20,7 +20,7 @@ class ImportanceSampler(DenseSampler):
     gradients: the weights are detached.
 
     Args:
-        num_samples: intervals added to those of the level before.
+        num_samples: intervals added to those of the previous level.
     """
 
     def __init__(self, num_samples: int = 128):

@@ -51,14 +51,14 @@ class OccupancySampler(RaggedSampler):
         resolution: cells along a side of the box; a multiple of 4.
         num_steps: intervals across the diagonal of the scene's box.
         update_every: steps between two updates of the grid.
-        warmup_steps: until then every cell is asked at each update, later every other one.
-        prune_after: steps before which no cell is given up; larger where the background is baked into the pictures,
-            so that dark content is not lost before it is learnt.
-        decay: of the average, per update.
-        min_alpha: opacity of an interval that counts.
-        opaque_below: a ray's samples end where less light than this is left; 0 keeps them all.
-        capacity: size of the arrays of samples on GPUs, where no size is read on the host; what does not fit is dropped
-            and counted. None: twice data.sample_budget, or 2^20 where that is null.
+        warmup_steps: steps in which each update evaluates every cell; later, every other cell.
+        prune_after: steps before any cell is pruned; larger if the background is baked into the images, so that dark
+            content is not lost before it is learned.
+        decay: decay rate of the running density, per update.
+        min_alpha: minimum opacity of an occupied interval.
+        opaque_below: samples end where the transmittance falls below this; 0 keeps all.
+        capacity: size of the arrays of samples on GPUs, where no size is read on the host; samples that do not fit are
+            dropped and counted. None: twice data.sample_budget, or 2^20 if that is None.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class OccupancySampler(RaggedSampler):
         self.grid.aabb.copy_(scene.aabb)
         self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
-        # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
+        # In normalized device coordinates cells are not where the cameras see them, but all of them are seen.
         if scene.space == "ndc":
             self.grid.possible.fill_(True)
         else:
@@ -123,7 +123,7 @@ class OccupancySampler(RaggedSampler):
         if inside:
             log.warning(
                 "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
-                "learnt. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
+                "learned. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
                 "make the box smaller (scene.aabb_half).",
                 inside,
                 eyes.shape[0],

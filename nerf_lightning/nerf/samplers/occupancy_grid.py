@@ -66,7 +66,7 @@ class OccupancyGrid(nn.Module):
         return OccupancyCells(self.aabb, self.cells, leaps)
 
     def reset(self) -> None:
-        """Forget what was learnt: every possible cell is occupied."""
+        """Forget what was learned: every possible cell is occupied."""
         self.density.zero_()
         self.occupy(self.possible)
 
@@ -101,7 +101,7 @@ class OccupancyGrid(nn.Module):
         return self._from_cells(cell + within)
 
     def cell_centers(self) -> tuple[Float[Tensor, "cells 3"], float]:
-        """Return the centres of the cells, and half the diagonal of a cell."""
+        """Return the centers of the cells, and half the diagonal of a cell."""
         along = torch.arange(self.resolution, device=self.aabb.device)[:, None] + 0.5
         axes = self._from_cells(along).unbind(dim=-1)
         half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) / self.resolution

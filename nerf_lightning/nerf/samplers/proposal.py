@@ -16,7 +16,7 @@ class ProposalSampler(DenseSampler):
 
     Args:
         num_samples: intervals of this level.
-        padding: weight added to each interval of the level before, so that what it overlooks is still found.
+        padding: weight added to each interval of the previous level, so that content it misses is still sampled.
     """
 
     def __init__(self, num_samples: int = 32, padding: float = 0.01):

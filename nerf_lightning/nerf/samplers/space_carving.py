@@ -1,4 +1,4 @@
-"""What the photographs' frames and alpha say of space before anything is learnt: seen at all, and not seen through."""
+"""What the photographs' frames and alpha say of space before anything is learned: seen at all, and not seen through."""
 
 import math
 from types import ModuleType
@@ -14,7 +14,7 @@ from nerf_lightning.nerf.kernels.carving import reference as carving_reference
 from nerf_lightning.nerf.types.scene import Scene
 
 WRONG_BY = math.radians(1.0)
-"""Cameras that are learnt may be turned by so much."""
+"""Cameras that are learned may be turned by so much."""
 AGREEING = 3
 """So many of them must see through a cell."""
 
@@ -28,13 +28,13 @@ def possible_cells(
     a ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha
     nothing is carved.
 
-    What is carved is gone for good, and cameras that are learnt may begin at a wrong place. They carve less: not within
-    1 degree of what their photographs show, and what three of them agree on.
+    Carving is permanent, and cameras that are learned may start at a wrong pose. They carve less: not within 1 degree
+    of what their photographs show, and only what three of them agree on.
 
     Args:
         scene: cameras and pixels.
-        centers: the cells' centres in scene units.
-        half_diagonal: from a cell's centre to its corner.
+        centers: the cells' centers in scene units.
+        half_diagonal: from a cell's center to its corner.
         most_views: carving looks at so many views, evenly spread.
     """
     views, steps = scene.splits["train"], _steps(scene, centers)

@@ -12,7 +12,7 @@ class Progress:
     step: int = 0
     """Steps taken in this attempt."""
     rays_seen: int = 0
-    """Rays trained on in this attempt, those of the centre crop included."""
+    """Rays trained on in this attempt, those of the center crop included."""
     batch_rays: int = 0
     """Rays of the next step; they may adapt to how many samples a ray has."""
     largest_batch: int = 0

@@ -19,8 +19,8 @@ class RayBundle(TensorStruct):
     near: Float[Tensor, "*rays"]
     far: Float[Tensor, "*rays"]
     view_directions: Float[Tensor, "*rays 3"]
-    """Where the camera looks in the world, unit length: what colour depends on. Differs from `directions` in
-    normalised device coordinates."""
+    """Where the camera looks in the world, unit length: what color depends on. Differs from `directions` in
+    normalized device coordinates."""
     photograph: Int[Tensor, "*rays"] | None = None
     """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
     films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen. Models
@@ -163,4 +163,4 @@ class Target(TensorStruct):
     certainty: Float[Tensor, "*rays"] | None = None
     """How much each distance counts, in [0, 1]; 0 where it is unknown."""
     infinity: Float[Tensor, "*rays"] | None = None
-    """Where along each ray the world ends, in normalised device coordinates; None: nowhere."""
+    """Where along each ray the world ends, in normalized device coordinates; None: nowhere."""

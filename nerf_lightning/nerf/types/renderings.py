@@ -18,7 +18,7 @@ class FieldOutput(TensorStruct):
     rgb: Float[Tensor, "*points 3"]
     """In [0, 1]."""
     channels: dict[str, Float[Tensor, "*points _"]] = field(default_factory=dict, kw_only=True)
-    """Whatever else a field says (features, classes, normals), by name; composited and rendered like colour."""
+    """Whatever else a field says (features, classes, normals), by name; composited and rendered like color."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Rendering(TensorStruct):
     rgb: Float[Tensor, "*rays 3"]
     """Composited over the background, exactly once."""
     foreground: Float[Tensor, "*rays 3"]
-    """The scene's own light, before the background: sum of weights times colour."""
+    """The scene's own light, before the background: sum of weights times color."""
     opacity: Float[Tensor, "*rays"]
     """Sum of weights."""
     depth: Float[Tensor, "*rays"]
@@ -36,7 +36,7 @@ class Rendering(TensorStruct):
     penalty: Float[Tensor, "*rays"] | None = field(default=None, kw_only=True)
     """What a level in training adds to the loss of each ray, whatever the loss; None: nothing."""
     channels: dict[str, Float[Tensor, "*rays _"]] = field(default_factory=dict, kw_only=True)
-    """The field's channels, composited like colour over nothing: sums of weights times values."""
+    """The field's channels, composited like color over nothing: sums of weights times values."""
 
     @classmethod
     def from_light(

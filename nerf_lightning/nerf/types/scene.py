@@ -1,19 +1,22 @@
 """What a reader returns: cameras, pixels, and where the content lies."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+import importlib
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.poses import flip_yz
 from nerf_lightning.nerf.types.rays import KnownDepths
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
 """What lies behind the scene.
 
-`random`: a colour drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
+`random`: a color drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
 `white_or_random`: the same, but white behind pixels that may show some of a background that was cut out (`UNSURE`).
 `black_or_random`: the same with black, which it is at evaluation, too. `none`: nothing. The last interval of a dense
 level takes all the light that is left; levels behind an occupancy grid have no such interval, and leave it black.
@@ -29,8 +32,12 @@ LensModel = Literal["pinhole", "radial_tangential", "fisheye", "equirectangular"
 panoramas, which show all directions, in `geometry.panoramas`."""
 
 Space = Literal["bounded", "ndc", "contracted"]
-"""How much of the world is modelled: a box, all that lies in front of a near plane (normalised device coordinates), or
+"""How much of the world is modeled: a box, all that lies in front of a near plane (normalized device coordinates), or
 everything, contracted around a box."""
+
+
+OPENCV_ORDER, OPENCV_FISHEYE = [0, 1, 4, 5, 2], [0, 1, 2, 3]
+"""Where OpenCV's coefficients stand among `Cameras.lens`."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,7 @@ class Cameras(TensorStruct):
     """Cameras, one per view, through lenses of one kind."""
 
     c2w: Float[Tensor, "*views 3 4"]
-    """Camera-to-world; the columns are right, up, back and the camera's centre."""
+    """Camera-to-world; the columns are right, up, back and the camera's center."""
     focal: Float[Tensor, "*views 2"]
     """Focal lengths in pixels along x and y; of panoramas, pixels per radian."""
     center: Float[Tensor, "*views 2"]
@@ -52,8 +59,75 @@ class Cameras(TensorStruct):
     height: Int[Tensor, "*views"]
     """Image height in pixels."""
     ndc: Float[Tensor, "*views 2"] | None = None
-    """Focal length over half the image's size, where rays run through normalised device coordinates (`geometry.ndc`)
+    """Focal length over half the image's size, where rays run through normalized device coordinates (`geometry.ndc`)
     and the world's z axis is the captures' back; None: rays run through the world."""
+
+    @classmethod
+    def from_opencv(
+        cls,
+        c2w: Float[Tensor, "*views rows 4"],
+        matrix: Float[Tensor, "*#views 3 3"],
+        size: tuple[int, int] | Int[Tensor, "*#views 2"],
+        distortion: Float[Tensor, "*#views k"] | None = None,
+        fisheye: bool = False,
+        pixel_center: float = 0.5,
+    ) -> "Cameras":
+        """Return cameras whose axes are right, down, forward, as in OpenCV, COLMAP and nerfstudio's files.
+
+        Args:
+            c2w: camera to world; `torch.linalg.inv` of OpenCV's extrinsics. A fourth row is left out.
+            matrix: the camera matrix, in pixels.
+            size: (width, height) in pixels.
+            distortion: k1, k2, p1, p2 and perhaps k3 of `cv2.projectPoints`; of a fisheye up to four k of
+                `cv2.fisheye`; None: a pinhole.
+            fisheye: which of the two.
+            pixel_center: where the center of the first pixel lies: 0.5 as in COLMAP, 0 as `cv2.calibrateCamera` has it.
+
+        Raises:
+            InputError: a skewed camera matrix, or coefficients that no lens here has (a rational or prism model).
+        """
+        views = c2w.shape[:-2]
+        given = torch.zeros(*views, 0) if distortion is None else distortion.to(c2w.device).expand(*views, -1)
+        most = 4 if fisheye else 5
+        skew = matrix[..., 0, 1].abs() > 1e-6 * matrix[..., 0, 0].abs()
+        if bool(skew.any()) or bool((given[..., most:] != 0).any()):
+            raise InputError(
+                f"The camera matrix is skewed, or the lens has more than {most} coefficients (k1 k2 p1 p2 k3; of a "
+                "fisheye k1 k2 k3 k4), which no lens here has. Undistort the photographs first."
+            )
+        lens = torch.zeros(*views, 6, device=c2w.device)
+        places = OPENCV_FISHEYE if fisheye else OPENCV_ORDER
+        for place, value in zip(places, given[..., :most].unbind(dim=-1), strict=False):
+            lens[..., place] = value.to(lens)
+        width, height = torch.as_tensor(size, device=c2w.device).expand(*views, 2).unbind(dim=-1)
+        matrix = matrix.to(c2w).expand(*views, 3, 3)
+        return cls(
+            c2w=flip_yz(c2w[..., :3, :]),
+            focal=torch.stack([matrix[..., 0, 0], matrix[..., 1, 1]], dim=-1).float(),
+            center=(matrix[..., :2, 2] + (0.5 - pixel_center)).float(),
+            lens=lens,
+            lens_model="fisheye" if fisheye else "pinhole" if distortion is None else "radial_tangential",
+            width=width,
+            height=height,
+        )
+
+    def to_opencv(
+        self, pixel_center: float = 0.5
+    ) -> tuple[Float[Tensor, "*views 3 4"], Float[Tensor, "*views 3 3"], Float[Tensor, "*views k"]]:
+        """Return what `from_opencv` takes: camera to world, camera matrix, and k1 k2 p1 p2 k3 (a fisheye's four k).
+
+        Raises:
+            InputError: a panorama, or a fourth radial coefficient, which OpenCV gives another meaning.
+        """
+        fisheye = self.lens_model == "fisheye"
+        if self.lens_model == "equirectangular" or (not fisheye and bool((self.lens[..., 3] != 0).any())):
+            raise InputError(
+                "OpenCV has no panoramas, and no k4 of this meaning: these cameras cannot be written as its."
+            )
+        matrix = torch.diag_embed(torch.cat([self.focal, torch.ones_like(self.focal[..., :1])], dim=-1))
+        matrix[..., :2, 2] = self.center + (pixel_center - 0.5)
+        order = OPENCV_FISHEYE if fisheye else OPENCV_ORDER
+        return flip_yz(self.c2w), matrix, self.lens[..., order]
 
 
 @dataclass(frozen=True)
@@ -98,7 +172,7 @@ class Truth:
     """The exact geometry of each pixel, where a scene knows it. Flat like the pixel store."""
 
     depth: Float[Tensor, "pixels"]
-    """Distance along the unit ray through the pixel's centre to the first surface; inf where there is none."""
+    """Distance along the unit ray through the pixel's center to the first surface; inf where there is none."""
     normals: Float[Tensor, "pixels 3"]
     """Unit surface normal in world axes, facing the camera; zero where there is no surface."""
 
@@ -121,7 +195,7 @@ class SceneRecord:
     view_names: tuple[str, ...]
     background: Background
     to_user: Float64[Tensor, "4 4"]
-    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of metres."""
+    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of meters."""
     space: Space = "bounded"
     metres_per_unit: float | None = None
     """How long a unit of the user's frame is; None: nobody has said."""
@@ -129,6 +203,14 @@ class SceneRecord:
     """Number of the capture that each view belongs to, where several were joined; None: one capture."""
     captures: tuple[str, ...] = ()
     """The names of the captures that were joined."""
+
+    @property
+    def user_cameras(self) -> Cameras:
+        """The cameras in the user's own frame, poses in float64: what `model.render` takes."""
+        linear, c2w = self.to_user[:3, :3], self.cameras.c2w.double()
+        rotation = linear / torch.linalg.det(linear) ** (1 / 3)
+        centers = linear @ c2w[..., 3:] + self.to_user[:3, 3:]
+        return replace(self.cameras, c2w=torch.cat([rotation @ c2w[..., :3], centers], dim=-1), ndc=None)
 
     @property
     def trained_captures(self) -> tuple[str, ...]:
@@ -160,4 +242,34 @@ class Scene(SceneRecord):
     left_out: tuple[str, ...] = ()
     """Photographs of the capture that have no pose, and so are no views."""
     refined: bool = False
-    """Whether its cameras learn with the model, or have learnt: they stand near where the photographs were taken."""
+    """Whether its cameras learn with the model, or have learned: they stand near where the photographs were taken."""
+
+    @classmethod
+    def from_cameras(
+        cls,
+        images: Any,
+        cameras: Cameras,
+        points: Any = None,
+        masks: Any = None,
+        background: str | None = None,
+        **settings: Any,
+    ) -> "Scene":
+        """Return a scene of images and cameras in memory; frame, extent and space follow from them as from a capture.
+
+        Args:
+            images: a list or an array of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
+                sizes may differ.
+            cameras: one per image, in the user's own frame and units (float64 where that is a map's).
+            points: sparse points in that frame, (points, 3), which tell where the content lies; None: unknown.
+            masks: for each image (height, width), above 0 where a pixel is learned from and judged; None: everywhere.
+            background: what lies behind the scene: white, black, random or none; None: black.
+            **settings: `names` of the views; `held_out`, the numbers of the views that are not learned from but judged
+                by (none: `val` and `test` are empty); `space`, `near`, `far` and `name` as in `nl.read`.
+
+        Raises:
+            InputError: images, masks and cameras that do not fit together, or no scene.
+        """
+        # By name: this package imports nothing that reads captures.
+        reader = importlib.import_module("nerf_lightning.data.captures.in_memory")
+        scene: Scene = reader.scene_from_cameras(images, cameras, points, masks, background, **settings)
+        return scene

@@ -20,7 +20,7 @@ class Checkpoints(Callback):
     While gradients or weights are not finite nothing is saved, so that the last is one to go back to (`NanGuard`).
 
     Args:
-        every_steps: steps between two writes of `last.ckpt`.
+        every_steps: steps between checkpoints (`last.ckpt`).
         monitor: the logged value whose maximum is the best.
     """
 

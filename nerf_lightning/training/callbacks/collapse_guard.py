@@ -21,10 +21,10 @@ class CollapseGuard(Callback):
     With ReLU densities and a white background a run may fall into "all is empty", where no gradient leads out. The sign
     is the spread (standard deviation over rays) of the scene's own light, before the background: below
     `ratio` times the spread of the targets at `patience` looks in a row. The restart draws new weights, a new order
-    of rays, and goes through the centre crop again; steps already taken are not given back.
+    of rays, and goes through the center crop again; steps already taken are not given back.
 
     Args:
-        every_steps: steps between two looks.
+        every_steps: steps between two histograms.
         until_step: steps after the crop from which on the guard trusts the run.
         patience: looks in a row that must fail.
         ratio: smallest share of the targets' spread that counts as alive.
@@ -51,16 +51,53 @@ class CollapseGuard(Callback):
         self.failed = 0
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Look now and then."""
-        progress, batches = pl_module.step.progress, trainer.datamodule.batches  # type: ignore[attr-defined]
+        """Look now and then, and log a restart."""
+        batches, optimizer = trainer.datamodule.batches, pl_module.optimizers().optimizer  # type: ignore[attr-defined]
+        message = self.look(pl_module.step, batches, optimizer, outputs["step"], trainer.global_step)
+        if message is None:
+            return
+        for logger in trainer.loggers:
+            logger.log_metrics({"train/attempt": pl_module.step.progress.attempt}, trainer.global_step)
+        for writer in tensorboard_writers(trainer.loggers):
+            writer.add_text("collapse_guard", message, trainer.global_step)
+
+    def look(self, step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
+        """Look, where it is time, and restart a run that has collapsed.
+
+        Args:
+            step: of the run, after it was taken.
+            batches: of the run.
+            optimizer: of the run.
+            output: what the step saw.
+            num_steps: taken so far, those of earlier attempts included.
+
+        Returns:
+            What was done; None: nothing.
+        """
+        progress = step.progress
         after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
-            return
-        seen = whole_batch(outputs["step"])
-        self.failed = self.failed + 1 if is_constant(seen, self.ratio) else 0
-        if self.failed >= self.patience:
-            self.failed = 0
-            self._restart(trainer, pl_module)
+            return None
+        self.failed = self.failed + 1 if is_constant(whole_batch(output), self.ratio) else 0
+        if self.failed < self.patience:
+            return None
+        self.failed = 0
+        if progress.restarts >= self.max_restarts:
+            log.warning(
+                "Step %d: the renders are constant again, after %d restarts; training goes on as it is. Check the "
+                "poses, near and far, or try field.density_activation=softplus, scene.background=random or a smaller "
+                "optimizer.lr.",
+                num_steps,
+                progress.restarts,
+            )
+            return None
+        step.restart(optimizer)
+        message = (
+            f"Step {num_steps}: the renders are constant while the photographs are not (a collapsed run). "
+            f"Restarted with new weights: attempt {progress.restarts + 1} of at most {self.max_restarts + 1}."
+        )
+        log.warning(message)
+        return message
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the looks across a resume."""
@@ -69,28 +106,6 @@ class CollapseGuard(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the count up again."""
         self.failed = state_dict["failed"]
-
-    def _restart(self, trainer: Trainer, system: Any) -> None:
-        step, restarts = trainer.global_step, system.step.progress.restarts
-        if restarts >= self.max_restarts:
-            log.warning(
-                "Step %d: the renders are constant again, after %d restarts; training goes on as it is. Check the "
-                "poses, near and far, or try field.density_activation=softplus, scene.background=random or a smaller "
-                "optimizer.lr.",
-                step,
-                restarts,
-            )
-            return
-        system.step.restart(system.optimizers().optimizer)
-        message = (
-            f"Step {step}: the renders are constant while the photographs are not (a collapsed run). "
-            f"Restarted with new weights: attempt {restarts + 2} of at most {self.max_restarts + 1}."
-        )
-        log.warning(message)
-        for logger in trainer.loggers:
-            logger.log_metrics({"train/attempt": system.step.progress.attempt}, step)
-        for writer in tensorboard_writers(trainer.loggers):
-            writer.add_text("collapse_guard", message, step)
 
 
 def whole_batch(output: StepOutput) -> dict[str, torch.Tensor]:

@@ -21,7 +21,7 @@ class Monitor(Watcher):
     They go straight to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
-        every_steps: steps between two rows.
+        every_steps: steps between two points of the curves.
     """
 
     def __init__(self, every_steps: int = 50):
@@ -85,7 +85,7 @@ def level_scalars(
     Args:
         names: of the levels.
         losses: of each, of whatever kind.
-        errors: the mean squared error of the colours that each shows.
+        errors: the mean squared error of the colors that each shows.
         pictures: the names of the levels that show some, whose PSNR is logged.
     """
     losses, shown = torch.stack([losses, psnr(errors)]).cpu()  # the device is read once

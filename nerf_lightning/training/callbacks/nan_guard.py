@@ -13,6 +13,12 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints, writer
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
+from nerf_lightning.training.step import TrainStep
+
+CURE = (
+    "a smaller optimizer.lr, gradient clipping (trainer.clip_norm=1) or trainer.precision=32-true, and check the "
+    "capture's poses, near and far"
+)
 
 log = logging.getLogger(__name__)
 
@@ -26,12 +32,12 @@ class NanGuard(Callback):
     already taken are not given back. Rate and attempt are part of the checkpoints that follow.
 
     Args:
-        on_nan: stop ends the run; rollback goes back to the last good checkpoint, and on at a lower rate.
-        patience: so many bad steps in a row are too many.
-        factor: what a rollback multiplies the learning rate by.
-        max_rollbacks: how often it rolls back before it stops.
-        every_steps: steps between two looks at the weights, and at the count of bad steps where reading it would
-            stop the device (elsewhere it is read at each step).
+        on_nan: stop ends the run; rollback returns to the last good checkpoint and continues at a lower learning rate.
+        patience: the number of consecutive bad steps that triggers it.
+        factor: the factor by which a rollback multiplies the learning rate.
+        max_rollbacks: the maximum number of rollbacks before it stops.
+        every_steps: steps between checks of the weights, and of the count of bad steps on devices that reading it would
+            stall (elsewhere it is read in each step).
     """
 
     def __init__(
@@ -62,23 +68,26 @@ class NanGuard(Callback):
         Raises:
             InputError: it does not, and is not to be rolled back, or was too often.
         """
-        guard, step = pl_module.step.guard, pl_module.step.progress.step
-        looks = step % self.every_steps == 0
-        if (looks or pl_module.device.type == "cpu") and guard.in_row >= self.patience:
-            cause = (
-                f"The loss or its gradients are not finite numbers since step {step - guard.in_row + 1} "
+        if cause := self.cause(pl_module.step):
+            self._act(trainer, pl_module, cause)
+
+    def cause(self, step: TrainStep) -> str | None:
+        """Say why a run learns nothing any more, after a step of it; None: it does, or it was not the time to look."""
+        guard, number = step.guard, step.progress.step
+        looks = number % self.every_steps == 0
+        if (looks or step.device.type == "cpu") and guard.in_row >= self.patience:
+            return (
+                f"The loss or its gradients are not finite numbers since step {number - guard.in_row + 1} "
                 f"({guard.in_row} steps in a row, all left out; first in the gradient of {guard.first_module})"
             )
-        elif looks and (broken := pl_module.step.broken_weights()):
-            cause = f"The weights of step {step} are not finite numbers (first those of {broken})"
-        else:
-            return
-        self._act(trainer, pl_module, cause)
+        if looks and (broken := step.broken_weights()):
+            return f"The weights of step {number} are not finite numbers (first those of {broken})"
+        return None
 
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
         good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.step.progress
         if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
-            raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
+            raise InputError(f"{cause}, so the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
         place = f"checkpoint {good}" if good is not None else "beginning, with new weights, as no checkpoint was saved"
         rate = system.optimizers().param_groups[0]["base_lr"]
@@ -110,16 +119,12 @@ class NanGuard(Callback):
             group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (former.rollbacks + 1 - lowered)
 
     def _advice(self, trainer: Trainer, good: Path | None) -> str:
-        settings = (
-            "a smaller optimizer.lr, gradient clipping (trainer.clip_norm=1) or trainer.precision=32-true, and check "
-            "the capture's poses, near and far"
-        )
         if good is None:
-            return f"No checkpoint was saved yet: begin anew with {settings}."
+            return f"No checkpoint was saved yet: begin anew with {CURE}."
         resume = f"resume={trainer.default_root_dir} callbacks.nan_guard.on_nan=rollback"
         lower = f"Go on from it at a lower rate with {resume}, or begin" if self.on_nan == "stop" else "Begin"
         weights = f"a new run from its weights (init_from={good})"
-        return f"The last good checkpoint is {good}. {lower} {weights} with {settings}."
+        return f"The last good checkpoint is {good}. {lower} {weights} with {CURE}."
 
     def _last_good(self, trainer: Trainer) -> Path | None:
         writer(trainer, self).wait()

@@ -20,7 +20,7 @@ class ValidationPictures(Watcher):
     """Render one view of the validation split: truth, render, depth, error; and a frame of the progress video.
 
     Args:
-        every_steps: steps between two pictures; the first comes at step `every_steps`.
+        every_steps: steps between two images; the first is at step `every_steps`.
         view: which view of the validation split, by its number from 0.
     """
 

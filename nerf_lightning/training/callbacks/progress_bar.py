@@ -87,7 +87,7 @@ class TrainingProgress(ProgressBar):
             self.warned = True
             log.warning(
                 "At this speed the training takes another %s. model=auto (fast, or fast_proposal for photographs) "
-                "learns the same scene in minutes, and budget.seconds=300 ends it in five.",
+                "trains the same scene in minutes, and budget.seconds=300 ends it in five.",
                 spoken(left),
             )
 

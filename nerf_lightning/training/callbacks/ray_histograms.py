@@ -22,12 +22,12 @@ PARTS = 50
 class RayHistograms(Watcher):
     """Render some of the step's rays again, as training does, and tell for each level what lies along them.
 
-    A coarse level that has learnt nothing spreads its weight evenly. Weight that piles up at 0 or at 1 lies at the near
-    or the far bound, which then cut the scene.
+    A coarse level that has learned nothing spreads its weight evenly. Weight that piles up at 0 or 1 lies at the near
+    or far bound, which then cuts off the scene.
 
     Args:
-        every_steps: steps between two looks.
-        num_rays: how many of the rays of a step are looked along.
+        every_steps: steps between two histograms.
+        num_rays: number of rays of a step that are used.
     """
 
     def __init__(self, every_steps: int = 250, num_rays: int = 256):

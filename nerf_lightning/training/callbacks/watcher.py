@@ -23,7 +23,7 @@ class Watcher(Callback):
     Nothing that training reads may be changed.
 
     Args:
-        every_steps: steps between two looks.
+        every_steps: steps between two histograms.
     """
 
     def __init__(self, every_steps: int):
@@ -83,9 +83,12 @@ def _writes(thread: threading.Thread | None) -> bool:
 
 
 def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
-    """Return the number-th validation view (counted round) and its picture, in the precision of training."""
+    """Return the number-th validation view (counted round) and its picture, in the precision of training.
+
+    Where there are none, of the training views.
+    """
     scene = trainer.datamodule.scene
-    views = scene.splits["val"]
+    views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
     tile_points = system.step.tile_points or WHOLE_BATCH_POINTS
     system.eval()

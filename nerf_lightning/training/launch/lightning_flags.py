@@ -1,6 +1,6 @@
 """Arguments of Lightning's Trainer that pass through (`trainer.lightning`), and those that settings of ours say.
 
-None that passes through changes what is learnt: they say what is measured, shown or tried out. So a run of other flags
+None that passes through changes what is learned: they say what is measured, shown or tried out. So a run of other flags
 is the same run.
 """
 

@@ -5,7 +5,7 @@ and the process leaves at once. Either way it ends with SystemExit(128 + signal)
 
 * SIGUSR1 in a Slurm job (sbatch --signal=USR1@90): the job is put back into the queue.
 * The signal of submitit (SIGUSR2 if not configured): submitit's own handler is called, which counts and requeues.
-* SIGTERM: nothing. Slurm itself requeues what it preempts, and what a person cancels shall stay cancelled.
+* SIGTERM: nothing. Slurm itself requeues what it preempts, and what a person cancels shall stay canceled.
 """
 
 import os

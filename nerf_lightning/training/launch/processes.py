@@ -80,7 +80,7 @@ def num_processes(devices: int | str, device_type: str) -> int:
     if not 1 <= count <= MOST_PROCESSES:
         raise InputError(f"trainer.devices={devices}: give a number from 1 to {MOST_PROCESSES}, or auto for every GPU.")
     if device_type != "cpu" and count > there:
-        raise InputError(f"trainer.devices={devices}: there are {there} devices here. Give at most so many, or auto.")
+        raise InputError(f"trainer.devices={devices}: there are {there} devices here. Give at most {there}, or auto.")
     return count
 
 

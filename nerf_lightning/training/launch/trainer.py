@@ -25,27 +25,28 @@ class TrainerSettings(ComputeSettings):
     """How and for how long to train.
 
     Args:
-        max_steps: steps of the training in all.
-        max_epochs: epochs in all, an epoch being every training ray once; None: no bound. The smaller bound counts.
-        accelerator: the kind of device; auto takes a GPU where there is one.
-        precision: of the products of the fields' weights, and of nothing else. bf16-mixed rounds their factors to
-            bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively
-            and the model is not slower in it, else 32-true.
-        tile_points: most points that a step sends through a field at once; auto takes the fastest of a few sizes,
-            measured at the start of a run (but for one of 50 steps or fewer) and kept; None trains a batch whole. The
-            result is the same up to rounding.
-        clip_norm: gradients are scaled down to this norm; None leaves them.
-        val_every_steps: steps between two looks at the validation rays.
-        num_threads: torch's threads on the CPU; None: one per core of ours.
+        max_steps: total number of training steps.
+        max_epochs: number of epochs, each being every training ray once; None: no limit. The smaller limit applies.
+        accelerator: the kind of device; auto: a GPU if there is one.
+        precision: the precision of products with the fields' weights, and of nothing else. bf16-mixed rounds their
+            factors to bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed if the device supports it
+            natively and the model is not slower in it, otherwise 32-true.
+        tile_points: maximum number of points that a step sends through a field at once; auto: the fastest of a few
+            sizes, measured at the start of a run of more than 50 steps; None: the whole batch. The result is the same
+            up to rounding.
+        clip_norm: maximum norm of the gradient, to which larger ones are scaled down; None: no clipping.
+        val_every_steps: steps between validations.
+        num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
-        cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves the time of asking for each;
-            not for refinement, correction and losses that learn. Not yet run on a GPU.
-        deterministic: refuse operations of GPUs whose sums depend on chance; the CPU's never do.
-        devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
-            TPU the cores, of one process.
-        launched_by: who starts the processes: nerf itself, torchrun, or Slurm's srun; then `devices` is theirs to say.
-        lightning: other arguments of Lightning's Trainer, such as trainer.lightning.profiler=simple; those that a
-            setting of ours says are refused.
+        cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
+            for refinement, correction and losses that learn. Not yet run on a GPU.
+        deterministic: refuse nondeterministic GPU operations; the CPU has none.
+        devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
+            in one process.
+        launched_by: what starts the processes: nerf itself, torchrun, or Slurm's srun; the latter two determine
+            `devices`.
+        lightning: other arguments of Lightning's Trainer, such as trainer.lightning.profiler=simple; those that another
+            setting controls are refused.
     """
 
     def __init__(

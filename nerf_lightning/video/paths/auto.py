@@ -11,7 +11,7 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.paths.sweep import Sweep
 
-FACING = 0.7  # Least cosine between where most photographs look and the centre.
+FACING = 0.7  # Least cosine between where most photographs look and the center.
 
 
 @final
@@ -20,8 +20,8 @@ class AutoPath(CameraPath):
     """A sweep along the photographs, or a spiral in front of what faces them.
 
     Args:
-        longest: where neither width nor height is given, the picture is as large as the photographs, but its longer
-            side has at most so many pixels: a film of photographs at full size takes hours.
+        longest: without width and height, the maximum length of the longer side, in pixels; otherwise images are as
+            large as the photographs. Films at full size take hours.
     """
 
     num_frames: int = 150
@@ -43,7 +43,7 @@ class AutoPath(CameraPath):
 
 @disable_autocast
 def looks_at_center(around: PathFrame) -> bool:
-    """Tell whether most photographs show the centre, seen from different sides; forward-facing captures have none."""
+    """Tell whether most photographs show the center, seen from different sides; forward-facing captures have none."""
     if around.forward_facing:
         return False
     offsets = normalize(around.poses[:, :, 3] - around.center, dim=-1)

@@ -6,7 +6,7 @@ files; `PathFrame.to_user` says how the working frame lies in it.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 
 import torch
@@ -25,6 +25,8 @@ from nerf_lightning.nerf.types.scene import Cameras
 NDC_FOCUS = 5.0  # What a camera in front of a scene looks at, in units of the near plane's distance.
 LARGEST = 1e15  # Larger numbers overflow when they are squared.
 
+Content = Callable[[], Float[Tensor, "points 3"]]
+
 
 @dataclass(frozen=True)
 class PathFrame:
@@ -35,7 +37,7 @@ class PathFrame:
     up: Float[Tensor, "3"]
     """Where the top of the picture points; any length but zero."""
     radius: float
-    """How far the photographs were taken from the centre, in scene units."""
+    """How far the photographs were taken from the center, in scene units."""
     focal: float
     """Focal length in pixels, for a picture of `width` by `height`."""
     width: int
@@ -47,7 +49,11 @@ class PathFrame:
     view_names: tuple[str, ...] = ()
     """What the photographs are called, in the order of `poses`."""
     forward_facing: bool = False
-    """Whether all photographs look the same way, into normalised device coordinates."""
+    """Whether all photographs look the same way, into normalized device coordinates."""
+    bounded: bool = False
+    """Whether nothing lies behind the content, so that it may be looked at from any distance."""
+    content: Content = lambda: torch.zeros(0, 3)
+    """Returns points of what the photographs show in their middle; none where no model is known."""
 
     @property
     def unit(self) -> float:
@@ -57,7 +63,7 @@ class PathFrame:
     def point(
         self, name: str, given: Sequence[int | float] | None, otherwise: Float[Tensor, "3"] | None = None
     ) -> Float[Tensor, "3"]:
-        """Return a point that the user gave as setting `name`, in scene coordinates; None: another (the centre)."""
+        """Return a point that the user gave as setting `name`, in scene coordinates; None: another (the center)."""
         if given is None:
             return self.center if otherwise is None else otherwise
         check_setting(name, given, is_point(given), "three finite numbers, [x, y, z], in the capture's own frame")
@@ -127,11 +133,11 @@ class CameraPath(ABC):
     """A path of virtual cameras for a video; a subclass adds the settings of its own.
 
     Args:
-        num_frames: how many cameras.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second at which the path is meant to be played.
+        num_frames: number of cameras.
+        width: image width in pixels; None: from the height, or as the photographs.
+        height: image height in pixels; None: from the width, or as the photographs.
+        fov: horizontal field of view in degrees; None: as the photographs.
+        fps: frames per second.
     """
 
     num_frames: int = 120
@@ -182,7 +188,7 @@ def frame_of(
     plane, and up is the mean camera's.
 
     Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal
-    point are left behind, for what is rendered on a path is seen through a centred pinhole. The default `up` is the
+    point are left behind, for what is rendered on a path is seen through a centered pinhole. The default `up` is the
     world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)

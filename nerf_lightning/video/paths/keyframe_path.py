@@ -25,11 +25,12 @@ class KeyframePath(CameraPath):
 
     Args:
         file: the keyframe file.
-        num_frames: how many cameras; None: as many as the keyframes' times and `fps` make, or 120 without times.
-        closed: go back to the first keyframe at the end, in a mean leg's time; the last frame then precedes the first.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in, for all frames; None: as the keyframes, else as the photographs.
+        num_frames: number of cameras; None: from the keyframes' times and `fps`, or 120 without times.
+        closed: return to the first keyframe at the end, in the mean time between keyframes; the last frame then
+            precedes the first.
+        width: image width in pixels; None: from the height, or as the photographs.
+        height: image height in pixels; None: from the width, or as the photographs.
+        fov: horizontal field of view in degrees, for all frames; None: as the keyframes, otherwise as the photographs.
         fps: frames per second.
     """
 

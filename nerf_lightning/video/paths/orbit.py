@@ -14,14 +14,14 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 @final
 @dataclass
 class Orbit(CameraPath):
-    """Circle around the centre, anticlockwise from above; the last frame precedes the first, not repeats it.
+    """Circle around the center, anticlockwise from above; the last frame precedes the first, not repeats it.
 
     Args:
-        elevation: degrees above the horizon, between -90 and 90, both excluded (there the picture has no up).
-        radius: distance from the centre in the capture's units; None: as far as the photographs were taken.
-        turns: full circles; negative goes clockwise.
-        start: azimuth of the first camera in degrees; 0 is on the world's x axis where up is z.
-        center: what it goes around, [x, y, z] in the capture's own frame; None: the middle of the scene.
+        elevation: degrees above the horizon, between -90 and 90, both excluded.
+        radius: distance from the center in the capture's units; None: that of the photographs.
+        turns: number of turns; negative: clockwise.
+        start: azimuth of the first camera in degrees; 0 is on the world's x axis if z is up.
+        center: the center of the circle, [x, y, z] in the capture's own frame; None: the center of the scene.
     """
 
     elevation: float = 30.0

@@ -18,9 +18,9 @@ class PhotographPath(CameraPath):
     """Go from photograph to photograph, where and as they were taken, at about one speed.
 
     Args:
-        views: photographs in the order of the path, each by its name, a pattern ("IMG_01*") or its number from 0;
-            None: all, in the capture's order.
-        closed: go back to the first one at the end; the last frame then precedes the first.
+        views: photographs in the order of the path: names, patterns ("IMG_01*") or numbers from 0; None: all, in the
+            capture's order.
+        closed: return to the first one at the end; the last frame then precedes the first.
     """
 
     views: list[str | int] | None = None

@@ -19,9 +19,9 @@ class Spiral(CameraPath):
     """Circle around the mean camera, within the reach of the photographs, looking at the middle.
 
     Args:
-        reach: size of the spiral as a share of how far the photographs were taken apart.
-        turns: full circles; on the way the camera goes once nearer and back.
-        target: what it looks at, [x, y, z] in the capture's own frame; None: the middle of the scene.
+        reach: size of the spiral, relative to the spread of the photographs.
+        turns: number of turns; during them, the camera moves closer once and back.
+        target: the point to look at, [x, y, z] in the capture's own frame; None: the center of the scene.
     """
 
     reach: float = 0.7

@@ -1,7 +1,7 @@
-"""A loop along the photographs: where they were taken from, aimed as they are, upright."""
+"""A loop along the photographs: where they were taken from, upright, with what they show in the middle."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import torch
@@ -14,20 +14,27 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
-CROSSED_BY_A_CIRCLE, CROSSED_BY_AN_ARC = 75.0, 40.0
-"""Degrees between neighbouring photographs, seen from above, over which a path may lead."""
+CROSSED_BY_A_CIRCLE, CROSSED, TIMES_THE_USUAL = 75.0, 25.0, 3.0
+"""Degrees between neighboring photographs, seen from above, over which a path may lead: these, or so many times the
+median where photographs lie farther apart; a circle over at most the first."""
 OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
-NEAREST = 0.1  # Quantile of the photographs' distances; nearer, content leaves the picture.
+NEAREST, FARTHEST = 0.1, 0.9
+"""Quantiles of the photographs' distances: nearer, content leaves the picture; from farther away one sees what no
+photograph shows."""
 HIGHEST = 80.0  # Degrees; straight above the content a picture has no up.
+MIDDLE, FRAMED = 2 / 3, 0.95
+"""Of the picture's width and height, and of the content that every frame shows there."""
+EASED = 12  # Of the loop, the part over which steps back are averaged: a twelfth.
 
 
 @final
 @dataclass
 class Sweep(CameraPath):
-    """Go along the photographs and back to the start, looking where those nearby look.
+    """Go along the photographs and back to the start, looking at what they show.
 
     A circle where photographs were taken from all sides, else to and fro along most of them. Height and distance are
-    those of the photographs nearby, so every frame shows what photographs saw, about as large as they show it.
+    those of the photographs nearby, so every frame shows what photographs saw. Where a model knows the content, the
+    camera steps back until that is in the middle of the picture; else it is aimed as those nearby.
 
     Args:
         smooth: degrees of azimuth over which height and distance are averaged.
@@ -56,10 +63,40 @@ class Sweep(CameraPath):
         distance = (weights @ distances.log()).exp().clamp(min=float(torch.quantile(distances, NEAREST)))
         level = azimuth.deg2rad().cos()[:, None] * east + azimuth.deg2rad().sin()[:, None] * north
         eyes = around.center + distance[:, None] * (height.cos() * level + height.sin() * up)
-        # Aimed as those nearby, of whose axes this is the point nearest to the centre.
+        content = around.content().to(eyes)
+        if len(content):
+            middle = content.quantile(content.new_tensor([1.0 - FRAMED, FRAMED]), dim=0).mean(dim=0)
+            cameras = self.pinholes(look_at(eyes, middle.expand_as(eyes), up), around)
+            farthest = math.inf if around.bounded else float(torch.quantile(distances, FARTHEST))
+            return step_back(cameras, content, (farthest - distance).clamp(min=0.0))
+        # Aimed as those nearby, of whose axes this is the point nearest to the center.
         axes = -around.poses[:, :, 2]
         aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
         return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)
+
+
+@disable_autocast
+def step_back(cameras: Cameras, content: Float[Tensor, "points 3"], most: Float[Tensor, "frames"]) -> Cameras:
+    """Return the cameras of a loop moved back along their axes, until most of the content is in their middle.
+
+    A camera whose middle reaches `half` to either side at unit depth shows a point (x, y, -z) there once it has moved
+    back by max(|x| / half_x, |y| / half_y) - z.
+
+    Args:
+        cameras: pinholes.
+        content: points.
+        most: how far each may move.
+    """
+    half = 0.5 * MIDDLE * torch.stack([cameras.width, cameras.height], dim=-1) / cameras.focal
+    x, y, minus_z = ((content - cameras.c2w[:, None, :, 3]) @ cameras.c2w[:, :, :3]).unbind(dim=-1)
+    needed = torch.maximum(x.abs() / half[:, :1], y.abs() / half[:, 1:]) + minus_z
+    most_of_them = math.ceil(FRAMED * len(content))
+    length = needed.kthvalue(most_of_them, dim=1).values.clamp(min=0.0).minimum(most)
+    reach = len(length) // (2 * EASED)
+    eased = torch.stack([length.roll(step) for step in range(-reach, reach + 1)]).mean(dim=0)
+    c2w = cameras.c2w.clone()
+    c2w[:, :, 3] += eased[:, None] * c2w[:, :, 2]
+    return replace(cameras, c2w=c2w)
 
 
 def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "frames"]:
@@ -72,12 +109,13 @@ def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "f
     """
     share = torch.arange(num_frames).to(taken) / num_frames
     in_order, gaps = gaps_around(taken)
-    if float(gaps.max()) <= CROSSED_BY_A_CIRCLE:
+    crossed = max(CROSSED, TIMES_THE_USUAL * float(gaps.median()))
+    if float(gaps.max()) <= min(crossed, CROSSED_BY_A_CIRCLE):
         return 360.0 * share
     # Begin after the widest gap, and part the photographs where gaps are wide.
     first = int(gaps.argmax()) + 1
     along = torch.cat([in_order[first:], in_order[:first] + 360.0])
-    ends = (gaps.roll(-first)[:-1] > CROSSED_BY_AN_ARC).nonzero()[:, 0] + 1
+    ends = (gaps.roll(-first)[:-1] > crossed).nonzero()[:, 0] + 1
     arc = max(torch.tensor_split(along, ends.tolist()), key=len)
     middle, half = 0.5 * (arc[0] + arc[-1]), 0.5 * OF_AN_ARC * (arc[-1] - arc[0])
     return middle + half * (2.0 * math.pi * share).sin()

@@ -113,7 +113,7 @@ def test_tracks_that_name_no_photograph_are_left_out(tmp_path):
 
 
 def with_sensor(root, maps):
-    """A capture of walls at depth 3, square to each camera, measured in millimetres by some of its views."""
+    """A capture of walls at depth 3, square to each camera, measured in millimeters by some of its views."""
     write_transforms(root, Known(size=(64, 48), focal=(60.0, 60.0), center=(32.0, 24.0)))
     content = json.loads((root / "transforms.json").read_text())
     (root / "depth").mkdir()
@@ -150,7 +150,7 @@ def test_depth_maps_that_cannot_be_used_are_left_out_and_named_once(tmp_path, ca
     lines = [record.message for record in caplog.records if "depth maps" in record.message]
     assert len(lines) == 1
     assert lines[0].startswith("2 depth maps are left out: 1.png has another shape than its photograph")
-    assert "2.png is no grey picture of 16 bits" in lines[0]
+    assert "2.png is no gray picture of 16 bits" in lines[0]
 
 
 def test_a_map_of_many_pixels_is_thinned(tmp_path):

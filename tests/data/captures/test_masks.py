@@ -26,7 +26,7 @@ def masked(scene, keep):
 
 
 def garbled(scene):
-    """Change the colours of the masked pixels."""
+    """Change the colors of the masked pixels."""
     rgba = scene.pixels.rgba.clone()
     rgba[scene.pixels.mask == 0] = torch.tensor([255, 0, 255, 255], dtype=torch.uint8)
     return replace(scene, pixels=replace(scene.pixels, rgba=rgba))

@@ -22,7 +22,9 @@ def with_lists(root, train, test, **more):
 def test_what_is_tested_is_not_learnt_from(tmp_path, caplog):
     root = with_lists(tmp_path / "c", NAMES, NAMES[7:], val_filenames=NAMES[6:7])
     assert read("transforms", root).splits == {"train": tuple(range(6)), "val": (6,), "test": (7, 8)}
-    said = "3 of 9 views are listed both to learn from and to judge by, and are not learnt from: images/p_6.png, images"
+    said = (
+        "3 of 9 views are listed both to learn from and to judge by, and are not learned from: images/p_6.png, images"
+    )
     assert caplog.text.count(said) == 1
 
 
@@ -37,7 +39,7 @@ def test_one_list_for_both_is_meant_and_said(tmp_path, caplog):
     for count in (1, 9):
         scene = read("transforms", with_lists(tmp_path / str(count), NAMES[:count], NAMES[:count]))
         assert scene.splits["train"] == scene.splits["test"] == tuple(range(count))
-        assert scene.protocol["test_views"] == "learnt from"
+        assert scene.protocol["test_views"] == "learned from"
     assert "the views to learn from are those to judge by" in caplog.text
 
 
@@ -56,7 +58,7 @@ def test_blender_files_that_are_copies_are_judged_by_what_is_learnt(tmp_path):
     (root / "transforms_test.json").write_text((root / "transforms_train.json").read_text())
     scene = BlenderReader(str(root)).read()
     assert len(scene.splits["train"]) == len(scene.splits["test"]) == 8
-    assert scene.protocol["test_views"] == "learnt from"
+    assert scene.protocol["test_views"] == "learned from"
 
 
 def with_focal(root, views, focal):

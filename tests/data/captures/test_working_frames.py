@@ -71,8 +71,8 @@ def test_photographs_on_their_side_are_put_upright(tmp_path):
     ("known", "kind", "space", "reason"),
     [
         (Known(c2w=wall()), "llff", "ndc", "all cameras look the same way and the capture gives depths"),
-        (Known(c2w=wall()), "transforms", "contracted", "whatever lies behind the content"),
-        (Known(), "llff", "contracted", "whatever lies behind the content"),
+        (Known(c2w=wall()), "transforms", "contracted", "show a background"),
+        (Known(), "llff", "contracted", "show a background"),
     ],
 )
 def test_auto_says_why(tmp_path, caplog, known, kind, space, reason):

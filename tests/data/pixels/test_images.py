@@ -23,7 +23,7 @@ from nerf_lightning.messages.errors import InputError
 
 
 def slow_downscale(rgba, factor):
-    """Average premultiplied colour block by block, in floating point."""
+    """Average premultiplied color block by block, in floating point."""
     height, width = rgba.shape[0] // factor, rgba.shape[1] // factor
     out = np.zeros((height, width, 4), dtype=np.uint8)
     for y in range(height):
@@ -124,7 +124,7 @@ RGB = [Image.fromarray(picture(view)[..., :3]) for view in range(3)]
 SEVERAL = {"save_all": True, "append_images": RGB[1:]}
 REFUSED = [
     ("a.tif", saved(Image.fromarray(np.full((2, 2), 0.5, np.float32)), "a.tif"), r"pixel mode 'F'.* 8-bit RGB"),
-    ("a.jpg", saved(Image.new("CMYK", (4, 4)), "a.jpg"), r"has CMYK colours.* `magick a.jpg -colorspace sRGB a.png`"),
+    ("a.jpg", saved(Image.new("CMYK", (4, 4)), "a.jpg"), r"has CMYK colors.* `magick a.jpg -colorspace sRGB a.png`"),
     ("a.webp", saved(RGB[0], "a.webp", **SEVERAL), r"holds 3 pictures.* Save each as a file of its own"),
     ("a.png", saved(RGB[0], "a.png", **SEVERAL), r"holds 3 pictures"),
     ("a.tiff", saved(RGB[0], "a.tiff", **SEVERAL), r"holds 3 pictures"),
@@ -184,7 +184,7 @@ def test_a_mask_may_be_in_alpha_or_red_alone(tmp_path, on):
 
 def test_a_mask_whose_channels_say_different_things_is_refused(tmp_path):
     Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]]], np.uint8)).save(tmp_path / "m.png")
-    with pytest.raises(InputError, match=r"mask .*m.png has colours or transparent pixels.* white is kept"):
+    with pytest.raises(InputError, match=r"mask .*m.png has colors or transparent pixels.* white is kept"):
         read_mask(tmp_path / "m.png")
 
 

@@ -1,4 +1,4 @@
-"""Things before one plain colour: what is found, what is not, and what is made transparent."""
+"""Things before one plain color: what is found, what is not, and what is made transparent."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def content(view):
 
 
 def pictures(color=WHITE, noise=0, count=VIEWS):
-    """Return opaque photographs of a coloured ring, whose hole shows the plain background, too."""
+    """Return opaque photographs of a colored ring, whose hole shows the plain background, too."""
     rng = np.random.default_rng(0)
     for view in range(count):
         rgb = np.array(color) + rng.integers(-noise, noise + 1, (HEIGHT, WIDTH, 3))
@@ -72,10 +72,10 @@ def test_over_the_same_colour_photographs_look_as_before():
     torch.testing.assert_close(blend(cut.rgba.float() / 255, torch.ones(1, 3)), before, rtol=0, atol=1 / 255)
 
 
-@pytest.mark.parametrize("name", ["noisy", "wanted", "alpha", "masks", "edges of many colours", "a thin margin"])
+@pytest.mark.parametrize("name", ["noisy", "wanted", "alpha", "masks", "edges of many colors", "a thin margin"])
 def test_anything_else_stays_as_it_is(name):
     rgbs = list(pictures(noise=8 if name == "noisy" else 0))
-    if name == "edges of many colours":
+    if name == "edges of many colors":
         rgbs = [rgb if view % 2 else rgb // 2 for view, rgb in enumerate(rgbs)]
     if name == "a thin margin":
         rgbs = [np.full((100, 100, 3), 255, dtype=np.uint8) for _ in rgbs]

@@ -81,7 +81,7 @@ def test_refuses_json_of_another_shape(root, content, message):
         ({"camera_angle_x": 1, "frames": [FRAME | {"file_path": "x" * 5000}]}, r"more than 1024 characters"),
         (
             {"camera_angle_x": 1, "frames": [FRAME | {"transform_matrix": [[2.0, 0, 0, 0], *pose(0)[1:]]}]},
-            r"the view \S+r_0 has a pose that is not a rotation and a centre",
+            r"the view \S+r_0 has a pose that is not a rotation and a center",
         ),
     ],
 )

@@ -33,7 +33,7 @@ PLACES = [(0.0, 0.0), (0.99, 0.0), (0.5, 0.5), (0.2, 0.9)]
 
 
 def true_rays(known, view, at=PLACES):
-    """Return the rays through pixel centres, by numpy alone."""
+    """Return the rays through pixel centers, by numpy alone."""
     pixels = np.floor(np.array(at) * known.size) + 0.5
     plane = (pixels - known.center) / known.focal
     local = np.stack([plane[:, 0], -plane[:, 1], -np.ones(len(at))], axis=1)
@@ -166,7 +166,7 @@ def test_the_lenses_of_a_transforms_json(tmp_path, top, model, lens):
 
 
 def write_masks(folder, names, colors=(255, 0)):
-    """Masks of one colour, with a row of the other, elsewhere for each view."""
+    """Masks of one color, with a row of the other, elsewhere for each view."""
     folder.mkdir(parents=True)
     for view, name in enumerate(names):
         mask = np.full((12, 16), colors[0], np.uint8)

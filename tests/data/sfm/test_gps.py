@@ -23,7 +23,7 @@ def photograph(path, place):
 
 
 def places_around(metres):
-    """Return latitude, longitude and height of points in metres east, north and up from a place."""
+    """Return latitude, longitude and height of points in meters east, north and up from a place."""
     return [
         (
             PLACE[0] + north / 111_190,
@@ -55,7 +55,7 @@ def test_degrees_become_metres():
 
 
 def synthetic(folder, spread, noise):
-    """Return a model of cameras whose photographs say where they are, in metres."""
+    """Return a model of cameras whose photographs say where they are, in meters."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 12, 40
     pycolmap.set_random_seed(0)

@@ -107,7 +107,7 @@ def test_frames_that_come_at_uneven_times_are_read_once_each(film, tmp_path):
 
 @pytest.fixture(scope="module")
 def hlg_film(tmp_path_factory):
-    """Three greys: the HLG signal 0.25, 0.5 and 0.75, of which the last is white."""
+    """Three grays: the HLG signal 0.25, 0.5 and 0.75, of which the last is white."""
     path = tmp_path_factory.mktemp("hlg") / "hlg.mp4"
     tags = "log-level=0:colorprim=bt2020:transfer=arib-std-b67:colormatrix=bt2020nc"
     grey = "color=s=192x64:d=0.3:r=10,format=yuv420p10le,geq=lum='64+876*(1+floor(X/64))/4':cb=512:cr=512"

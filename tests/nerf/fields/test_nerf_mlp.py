@@ -16,7 +16,7 @@ def paper_field(**changes):
 
 
 def test_the_shapes_are_the_papers():
-    """Figure 7: 63 in, 256 wide, the encoded position again at layer 5, 27 more into the colour head, 128 wide."""
+    """Figure 7: 63 in, 256 wide, the encoded position again at layer 5, 27 more into the color head, 128 wide."""
     field = paper_field()
     shapes = [tuple(layer[0].weight.shape) for layer in field.trunk]
     assert shapes == [(256, 63)] + [(256, 256)] * 4 + [(256, 256 + 63)] + [(256, 256)] * 2

@@ -69,7 +69,7 @@ def test_colours_have_the_slope_of_the_logistic_function_and_a_way_back_from_its
 
 
 def test_a_little_colour_among_much_black_is_learnt():
-    """The fault: all colours were 1e-38 after ten steps, with gradients as small, so a small thing was never seen."""
+    """The fault: all colors were 1e-38 after ten steps, with gradients as small, so a small thing was never seen."""
     field, positions = a_field(density_bias=-1.0), 2 * torch.rand(1000, 3) - 1
     field.fit_to(without_alpha(ball_scene()))
     small = (positions - 0.5).norm(dim=-1) < 0.3

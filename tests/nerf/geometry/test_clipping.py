@@ -1,4 +1,4 @@
-"""Rays cut to a box of the user's frame or of the scene, through the world and normalised device coordinates."""
+"""Rays cut to a box of the user's frame or of the scene, through the world and normalized device coordinates."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Pixels' cones: their size against neighbouring rays, their covariance against points drawn, and maps of space."""
+"""Pixels' cones: their size against neighboring rays, their covariance against points drawn, and maps of space."""
 
 from dataclasses import replace
 
@@ -20,13 +20,13 @@ from nerf_lightning.nerf.types.rays import PixelIndex, RaggedSamples, RaySamples
 
 
 def one_camera(size):
-    """Exact enough for differences of neighbouring rays."""
+    """Exact enough for differences of neighboring rays."""
     cameras = ball_scene(num_views=1, size=size).cameras
     return cameras.map(lambda each: each.double() if each.is_floating_point() else each)
 
 
 def three_rays(cameras, x, y):
-    """Through a pixel, its right neighbour and the one below."""
+    """Through a pixel, its right neighbor and the one below."""
     near = torch.zeros(len(cameras.width), dtype=cameras.focal.dtype)
     return [
         rays_through_pixels(cameras, PixelIndex(torch.zeros_like(x), x + right, y + down), near, near + 1)

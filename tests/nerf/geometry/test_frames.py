@@ -42,7 +42,7 @@ def rolled(c2w, degrees):
 
 
 def forward(count=9):
-    """A plane of cameras that look along +y, a little towards each other."""
+    """A plane of cameras that look along +y, a little toward each other."""
     place = torch.arange(count, dtype=torch.float64)
     eyes = torch.stack([0.3 * (place % 3 - 1), 0 * place, 0.3 * (place // 3 - 1)], dim=-1)
     return look_at(eyes, 0.3 * eyes + torch.tensor([0.0, 6.0, 0.0], dtype=torch.float64), Z)

@@ -1,4 +1,4 @@
-"""Normalised device coordinates: closed forms, straight lines, and the way back."""
+"""Normalized device coordinates: closed forms, straight lines, and the way back."""
 
 from dataclasses import replace
 

@@ -157,11 +157,11 @@ def test_what_a_lens_folds_back_into_the_image_is_not_seen_there():
 
 
 def test_a_sphere_beyond_the_rim_is_seen_where_it_reaches_into_the_image():
-    """The fault: its centre, beyond the fold of the lens, shown on the other side of the image."""
+    """The fault: its center, beyond the fold of the lens, shown on the other side of the image."""
     cameras = pinhole_cameras(torch.eye(4)[None, :3].double(), 90.0, 80, 80)
     lens = torch.tensor([[-0.36, 0.0, 0.0, 0.0, 0.0, 0.0]]).double()
     cameras = replace(cameras, lens=lens, lens_model="radial_tangential")
-    off_axis, heading = math.radians(60), math.sqrt(0.5)  # towards the lower right corner, which is 40 degrees off
+    off_axis, heading = math.radians(60), math.sqrt(0.5)  # toward the lower right corner, which is 40 degrees off
     center = torch.tensor([[math.sin(off_axis) * heading, -math.sin(off_axis) * heading, -math.cos(off_axis)]])
     x, y, radius = footprint(cameras, 0, 0.5 * center.double(), 0.2)  # 24 degrees around
     assert float(x) == pytest.approx(79.5, abs=1e-3)

@@ -53,7 +53,7 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     torch.testing.assert_close(parameter, torch.tensor([0.0, 1.0, 2.0]))
     assert backends.why_not("nerf_lightning.nerf.kernels.adam.cpu") == "RuntimeError: LLVM cannot select this"
     assert len(caplog.records) == 1
-    assert "the torch twins of its kernels run instead" in caplog.text
+    assert "PyTorch versions of its kernels run instead" in caplog.text
 
 
 @pytest.mark.parametrize(("takes", "said"), [(0.3, 1), (0.0, 0)])

@@ -70,7 +70,7 @@ def test_it_is_what_the_same_roundings_give(kernels, sizes, rows, dtype):
     of_points, of_weights = kernels.backward(grad, weights, kept, wants_points=True)
     assert of_points.shape == points.shape
     for found, expected in zip([out, of_points, *of_weights], reference(points, weights, grad), strict=True):
-        # A sum in float32 may round to the other neighbour than the exact one does: a unit here and there.
+        # A sum in float32 may round to the other neighbor than the exact one does: a unit here and there.
         assert far_apart(found, expected) < 2e-3
 
 

@@ -189,7 +189,7 @@ def test_it_goes_the_other_way_where_something_else_is_wanted():
     level.returns_weights = False
     assert level.takes_whole_rays(cpu, training=True, learns_cameras=False)
     assert not level.takes_whole_rays(cpu, training=True, learns_cameras=True)
-    turns = replace(rays, directions=rays.directions.clone().requires_grad_())  # a focal length that is learnt
+    turns = replace(rays, directions=rays.directions.clone().requires_grad_())  # a focal length that is learned
     assert isinstance(level(turns, None, [], None), RaggedRendering)
     assert not isinstance(level(rays, None, [], None), RaggedRendering)
     with torch.no_grad():

@@ -108,7 +108,7 @@ def test_a_fork_has_threads_of_its_own():
 @pytest.mark.parametrize("way", [search, search_by_comparison])
 def test_every_way_finds_what_numpy_finds(way, right, generator):
     ordered = torch.rand(5, 13, generator=generator).sort(-1).values
-    ordered[:, 4] = ordered[:, 3]  # equal neighbours
+    ordered[:, 4] = ordered[:, 3]  # equal neighbors
     numbers = torch.cat([torch.rand(5, 20, generator=generator) * 1.4 - 0.2, ordered], dim=-1)
     found = way(ordered, numbers, right)
     for row in range(5):

@@ -1,4 +1,4 @@
-"""Depth as supervision: closed forms, both layouts, normalised device coordinates, outliers, fading."""
+"""Depth as supervision: closed forms, both layouts, normalized device coordinates, outliers, fading."""
 
 import math
 from dataclasses import replace

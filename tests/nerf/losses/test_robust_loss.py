@@ -31,7 +31,7 @@ def test_fine_detail_and_small_blobs_are_kept_and_what_is_bad_at_a_border_is_not
         assert bool(kept(bad).all())
     expected = torch.ones(PATCH, PATCH, dtype=torch.bool)
     expected[:4, :4] = False
-    expected[3, 3] = True  # 5 of its 9 neighbours are good
+    expected[3, 3] = True  # 5 of its 9 neighbors are good
     assert torch.equal(kept(square(0, 0, 4)), expected)
     mostly = square(0, 0, 13)
     assert not bool(kept(mostly)[:12, :12].any())
@@ -71,7 +71,7 @@ def test_the_threshold_comes_down_to_the_quantile_and_the_passer_by_is_left_out_
         loss.learn(truth, photograph, weight)
     assert float(loss.threshold) == pytest.approx(4e-4, rel=1e-3)
     levels = loss([seen(truth)] * 2, target(photograph, weight))["color"]
-    # Three quarters of the pixels: none of the passer-by has as many good neighbours as bad ones.
+    # Three quarters of the pixels: none of the passer-by has as many good neighbors as bad ones.
     assert [float(level) for level in levels] == pytest.approx([0.75 * 1e-4] * 2, rel=1e-3)
     loss.forget()
     torch.testing.assert_close(loss([seen(truth)] * 2, target(photograph, weight)), plain)

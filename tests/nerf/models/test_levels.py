@@ -74,7 +74,7 @@ def both(**sampler):
     return packed, masked
 
 
-@pytest.mark.parametrize("background", ["a colour", "none"])
+@pytest.mark.parametrize("background", ["a color", "none"])
 @pytest.mark.parametrize("training", [True, False])
 def test_it_renders_what_the_packed_level_renders(background, training):
     packed, masked = both()
@@ -142,7 +142,7 @@ def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
 def test_rendering_in_rounds_equals_rendering_at_once(opaque_below, apart):
     """The same lattice, once with gradients (all samples of a ray in one go), once round by round.
 
-    Rounds leave out the colour of what is transparent: no difference is as large as one of 255 steps.
+    Rounds leave out the color of what is transparent: no difference is as large as one of 255 steps.
     """
     level, rays, background = a_level(opaque_below=opaque_below), some_rays(80), torch.rand(80, 3)
     whole = level(rays, background, [], None)

@@ -89,7 +89,7 @@ def test_depth_is_the_distance_along_the_ray_and_where_nothing_is_far_and_finite
 
 
 class Ball(Wall):
-    """Opaque inside a ball of this radius around (0, 0, -4); its colour is where it is looked at from."""
+    """Opaque inside a ball of this radius around (0, 0, -4); its color is where it is looked at from."""
 
     def density(self, points):
         away = points.positions - torch.tensor([0.0, 0.0, -4.0])

@@ -44,7 +44,7 @@ def a_step(scene, refinement, model=None):
 
 
 def learnt(scene, refinement, model, steps, decay=1.0):
-    """What has learnt the cameras of a known scene: in each step, from as many rays."""
+    """What has learned the cameras of a known scene: in each step, from as many rays."""
     step = a_step(scene, refinement, model)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     step.schedule, step.num_steps = ExponentialDecay(decay_rate=decay), steps

@@ -271,7 +271,7 @@ def test_in_normalised_device_coordinates_every_cell_is_possible():
 
 
 def test_the_centre_of_a_cell_is_the_middle_of_its_positions():
-    """Bit for bit: carving asks about the centres, training about points in the same cells."""
+    """Bit for bit: carving asks about the centers, training about points in the same cells."""
     sampler = OccupancySampler(resolution=12)
     sampler.grid.aabb.copy_(torch.tensor([[-1.1, -0.7, -0.3], [0.9, 1.7, 1.1]]))
     centers, half_diagonal = sampler.grid.cell_centers()

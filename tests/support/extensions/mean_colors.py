@@ -1,4 +1,4 @@
-"""An exporter that needs photographs: the mean colour of each, beside that of the model's picture of it."""
+"""An exporter that needs photographs: the mean color of each, beside that of the model's picture of it."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The MLP of the original NeRF, whose colour knows a code of each photograph (Sec. 4.1, arXiv 2008.02268)."""
+"""The MLP of the original NeRF, whose color knows a code of each photograph (Sec. 4.1, arXiv 2008.02268)."""
 
 import torch
 from torch import nn

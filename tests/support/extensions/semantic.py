@@ -1,4 +1,4 @@
-"""A channel of classes beside density and colour: where the photographs are bright (after arXiv 2103.15875)."""
+"""A channel of classes beside density and color: where the photographs are bright (after arXiv 2103.15875)."""
 
 import torch
 from torch import nn

@@ -1,4 +1,4 @@
-"""Density and colour at the corners of a grid over the scene's box, and no network (after arXiv 2111.11215)."""
+"""Density and color at the corners of a grid over the scene's box, and no network (after arXiv 2111.11215)."""
 
 import torch
 from torch import nn

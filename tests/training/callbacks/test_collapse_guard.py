@@ -87,7 +87,7 @@ def test_the_end_of_the_crop_is_watched_too():
 def test_constant_photographs_are_no_collapse_and_a_random_background_does_not_hide_one():
     flat = torch.full((64, 3), 0.5)
     assert not is_constant({"target": flat, "foreground": torch.zeros(64, 3), "weight": torch.ones(64)}, 0.02)
-    # The rendered colour varies with the background; the field's own light does not.
+    # The rendered color varies with the background; the field's own light does not.
     step = {"target": torch.rand(64, 3), "foreground": torch.full((64, 3), 0.3), "weight": torch.ones(64)}
     assert is_constant(step, 0.02)
 

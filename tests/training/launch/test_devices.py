@@ -2,6 +2,7 @@
 
 import logging
 import platform
+import warnings
 
 import pytest
 import torch
@@ -37,11 +38,26 @@ def test_a_gpu_that_cannot_be_used_leaves_the_work_to_the_cpu_unless_it_was_aske
     with caplog.at_level(logging.WARNING):
         assert working_device(CHOSEN, "auto") == ("cpu", "the GPU cannot be used")
     assert TROUBLES[answer] in caplog.text
-    assert "The CPU computes instead" in caplog.text
+    assert "The CPU is used instead" in caplog.text
     with pytest.raises(InputError, match="torch sees a GPU here") as refused:
         working_device(CHOSEN, "gpu")
     assert TROUBLES[answer] in str(refused.value)
     assert "trainer=cpu" in str(refused.value)
+
+
+def test_a_driver_that_is_too_old_is_named(monkeypatch, caplog):
+    old = "The NVIDIA driver on your system is too old (found version 11040)"
+
+    def is_available():
+        warnings.warn(f"CUDA initialization: {old}.", UserWarning, stacklevel=1)
+        return False
+
+    monkeypatch.setattr(torch.cuda, "is_available", is_available)
+    with pytest.raises(InputError, match="torch sees no CUDA device here") as refused:
+        devices.choose_device("gpu")
+    assert f"here. {old}. Use trainer=cpu" in str(refused.value)
+    assert devices.choose_device("auto") == ("cpu", "no GPU found")
+    assert caplog.messages == [f"The CPU computes, since torch cannot use the GPU here: {old}."]
 
 
 def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_name(monkeypatch):
@@ -74,6 +90,14 @@ def test_a_machine_that_runs_out_of_memory_ends_with_one_paragraph(error, reason
     assert told.startswith(f"There is no memory for this: {reason}. Use a smaller model")
     assert "\n" not in told
     assert paragraph(RuntimeError("a mistake of ours"), "train") is None
+
+
+@pytest.mark.parametrize("kind", [torch.AcceleratorError, RuntimeError])
+def test_a_gpu_that_fails_ends_with_one_paragraph(kind):
+    told = paragraph(kind("CUDA error: device-side assert triggered\nCompile with TORCH_USE_CUDA_DSA"), "render")
+    assert told is not None
+    assert told.startswith("The GPU has failed: CUDA error: device-side assert triggered")
+    assert "\n" not in told
 
 
 @pytest.fixture

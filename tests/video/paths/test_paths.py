@@ -15,7 +15,7 @@ from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
 from nerf_lightning.video.paths.auto import AutoPath, looks_at_center
 from nerf_lightning.video.paths.base import PathFrame, frame_of
 from nerf_lightning.video.paths.orbit import Orbit
-from nerf_lightning.video.paths.sweep import Sweep
+from nerf_lightning.video.paths.sweep import Sweep, azimuths
 
 
 def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64, poses=None):
@@ -125,7 +125,7 @@ def test_the_yaml_lists_the_constructors_defaults(name):
 
 
 def ring(degrees, elevation=40.0, radius=4.0):
-    """Cameras that look at the frame's centre from azimuths in degrees."""
+    """Cameras that look at the frame's center from azimuths in degrees."""
     azimuth, height = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)), math.radians(elevation)
     level = torch.stack([azimuth.cos(), azimuth.sin()], dim=-1) * math.cos(height)
     offsets = torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)
@@ -170,6 +170,26 @@ def test_a_sweep_comes_no_nearer_than_a_tenth_of_the_photographs():
     around = frame(poses=torch.cat([ring(range(0, 60, 3)), ring([30.0], 40.0, 0.5)]))
     offsets = Sweep(smooth=5.0).cameras(around).c2w[:, :, 3] - around.center
     assert offsets.norm(dim=-1).min() >= 4.0 - 1e-9
+
+
+def test_a_sweep_has_what_photographs_show_in_the_middle_of_every_frame():
+    random = torch.Generator().manual_seed(0)
+    content = frame().center + 2 * torch.rand(500, 3, dtype=torch.float64, generator=random) - torch.tensor([0.6, 1, 1])
+    poses = torch.cat([ring(range(0, 60, 3), radius=4.0), ring(range(0, 60, 15), radius=7.0)])
+    around = replace(frame(poses=poses), content=lambda: content, bounded=True)
+    for steps in (around, replace(around, bounded=False)):
+        cameras = Sweep(num_frames=9).cameras(steps)
+        pixel = torch.stack([project(cameras, view, content) for view in range(9)])
+        inside = ((pixel - cameras.center[0]).abs() <= torch.tensor([100.0, 80.0]) / 3).all(dim=-1)
+        torch.testing.assert_close(inside.double().mean(dim=1), torch.full((9,), 0.95).double(), atol=3e-3, rtol=0)
+    far = Sweep(num_frames=9).cameras(replace(around, content=lambda: 9 * content, bounded=False))
+    assert float((far.c2w[:, :, 3] - around.center).norm(dim=-1).max()) <= 7.0 + 1e-9
+
+
+def test_a_circle_is_not_led_over_a_gap_many_times_wider_than_the_usual():
+    assert float(azimuths(torch.arange(0.0, 360, 45), 8).max()) == 315.0
+    arc = azimuths(torch.arange(0.0, 316, 5), 8)
+    assert (float(arc.min()), float(arc.max())) == pytest.approx((375.75, 659.25))
 
 
 def test_a_sweep_stays_where_most_photographs_are():

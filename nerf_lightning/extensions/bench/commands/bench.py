@@ -1,4 +1,4 @@
-"""Measure training and rendering speed against plain float32 and against the machine's own matrix rate.
+"""Measure training and rendering speed, compared with plain PyTorch and with the machine's matrix rate.
 
 Medians of ratios: machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are
 compared round by round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32

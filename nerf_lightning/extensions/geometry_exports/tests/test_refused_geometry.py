@@ -46,7 +46,7 @@ def test_settings_that_make_no_sense_are_refused(exporter, settings, said):
 
 @pytest.mark.parametrize("exporter", [MeshExport, VolumeExport])
 def test_no_grid_is_laid_over_ndc_or_has_one_cell(tmp_path, exporter):
-    with pytest.raises(InputError, match=r"what=\w+: ball was trained in normalised device coordinates"):
+    with pytest.raises(InputError, match=r"what=\w+: ball was trained in normalized device coordinates"):
         exported(tmp_path, exporter(8), space="ndc")
     with pytest.raises(InputError, match=r"what\.resolution=1: give the number of cells"):
         exported(tmp_path, exporter(1))

@@ -21,7 +21,7 @@ DARK, LIGHT = (0.2, 0.3, 0.7), (0.9, 0.8, 0.3)
 
 
 def in_texture(picture, uv):
-    """Return the colours at places of a texture (v up), mixed between the four texels around each."""
+    """Return the colors at places of a texture (v up), mixed between the four texels around each."""
     height, width, _ = picture.shape
     x, y = (np.nan_to_num(uv) * (1, -1) + (0, 1)).reshape(-1, 2).T * np.array([[width], [height]]) - 0.5
     j, i = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -77,7 +77,7 @@ def test_a_checker_comes_back_in_place(tmp_path, format, surface):
     seen = points @ [1.0, 0.0, 0.0] > -0.2 if surface == "density" else clear
     expected = checker(torch.tensor(points)).numpy()
     wrong = np.abs(found - expected).max(axis=1) > 0.25
-    print(f"{wrong[clear & seen].mean():.4f} of {(clear & seen).sum()} are of the other colour")
+    print(f"{wrong[clear & seen].mean():.4f} of {(clear & seen).sum()} are of the other color")
     assert (clear & seen).sum() > 100
     assert wrong[clear & seen].mean() < 0.03
 

@@ -1,4 +1,4 @@
-"""Grids: the density where it is, in the user's units, and colours where something is."""
+"""Grids: the density where it is, in the user's units, and colors where something is."""
 
 import json
 import tracemalloc

@@ -118,5 +118,5 @@ def test_a_run_is_judged_on_a_scene_that_it_never_saw_and_renders_others(nerf, r
 @pytest.mark.parametrize("what", ["mesh", "page"])
 def test_what_needs_density_is_refused_by_name(nerf, run, tmp_path, what):
     result = nerf("export", f"ckpt={run}", f"what={what}", f"paths.output_dir={tmp_path}/out", "trainer=cpu")
-    said(result, "ViewTransformer renders rays and has neither density nor colour")
+    said(result, "ViewTransformer renders rays and has neither density nor color")
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Make a checkpoint smaller: fewer neurons in every hidden layer, hash tables in fewer bytes."""
+"""Write a smaller checkpoint: fewer neurons per hidden layer, quantized hash tables."""
 
 from dataclasses import fields, replace
 from pathlib import Path

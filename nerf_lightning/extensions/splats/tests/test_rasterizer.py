@@ -56,7 +56,7 @@ def some(count=40, degree=3, dtype=torch.float32):
 
 
 def test_one_splat_on_the_axis():
-    """Its standard deviation is 30 * 0.1 / 2 = 1.5 pixels; the middle pixel's centre is where its mean is."""
+    """Its standard deviation is 30 * 0.1 / 2 = 1.5 pixels; the middle pixel's center is where its mean is."""
     variance = 1.5**2 + 0.3
     for draw in (rasterize, reference):
         picture = draw(splat(), camera(), BLACK)
@@ -160,7 +160,7 @@ def test_the_gradients_of_the_reference_are_differences():
     where = replace(camera(6, 5, 5.0), rotation=torch.eye(3).double(), eye=torch.zeros(3).double())
     weight = torch.rand(5, 6, 3, generator=torch.Generator().manual_seed(2)).double()
 
-    def value(*rest):  # the means also turn the colours, which has no gradient
+    def value(*rest):  # the means also turn the colors, which has no gradient
         seen = reference(Gaussians(few.means, *rest), where, WHITE.double())
         return (seen * weight).sum()
 

@@ -59,12 +59,24 @@ def test_splats_lie_on_the_surface_in_the_captures_frame_and_none_is_haze(tmp_pa
     gsply = pytest.importorskip("gsply", reason="gsply is not installed (the extra splats)")
     to_user = similarity(upright_rotation(torch.tensor([1.0, 0.0, 0.0])), torch.tensor([5.0, 6.0, 7.0]), 100.0)
     scene = replace(ball_scene(num_views=12, size=24, background="random"), to_user=to_user)
-    _, (path, *_) = exported(tmp_path, solid(ball()), scene, photographs=False)
+    _, (path, *_) = exported(tmp_path, solid(ball()), scene, photographs=False, frame="capture")
     read = gsply.plyread(path)
     radius = np.linalg.norm(read.means - [5.0, 6.0, 7.0], axis=1) / 100.0
     assert len(radius) == 600
     assert np.abs(radius - 0.8).max() < 0.1
     assert np.exp(read.scales).max() < 30.0
+
+
+@pytest.mark.parametrize("settings", [{}, {"frame": "capture"}, {"format": "glb", "frame": "capture"}])
+def test_what_is_up_is_down_in_a_ply_unless_the_captures_axes_are_kept(settings):
+    """`save_splats` negates y and z for a GLB, in which up is y and a unit a meter."""
+    to_user = similarity(upright_rotation(torch.tensor([1.0, 0.0, 0.0])).mT, torch.zeros(3), 3.0)
+    record = scene_record(replace(ball_scene(), to_user=to_user, metres_per_unit=2.0))
+    matrix = SplatsExport(**settings)._to_file(record)
+    expected = {"ply": [0.0, -3.0, 0.0], "glb": [0.0, -6.0, 0.0]}[settings.get("format", "ply")]
+    if settings == {"frame": "capture"}:
+        expected = [3.0, 0.0, 0.0]
+    torch.testing.assert_close(matrix[:3, 2], torch.tensor(expected, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
 def test_a_photograph_through_a_lens_is_what_a_pinhole_sees():
@@ -103,10 +115,17 @@ def test_settings_that_make_no_sense_are_refused(settings, said):
     assert said in str(error.value)
 
 
-def test_normalised_device_coordinates_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"what=splats: ball was trained in normalised device coordinates"):
-        exported(tmp_path, solid(ball()), replace(ball_scene(), space="ndc"))
-    assert not list(tmp_path.iterdir())
+def test_normalised_device_coordinates_become_places_in_the_world(tmp_path):
+    """A wall at z = -3, where the third coordinate is 1 / 3, seen by cameras that look at it."""
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed (the extra splats)")
+    scene, wall = ball_scene(num_views=8, size=24), solid(lambda positions: 1 / 3 - positions[..., 2])
+    c2w = torch.eye(3, 4).repeat(8, 1, 1)
+    c2w[:, :2, 3] = 0.3 * torch.randn(8, 2, generator=torch.Generator().manual_seed(0))
+    cameras = replace(scene.cameras, c2w=c2w, ndc=torch.full((8, 2), 3.2))
+    scene = replace(scene, cameras=cameras, space="ndc", near=torch.zeros(8), far=torch.full((8,), 4.0))
+    for seconds in (0.0, 1.0):
+        _, (path, *_) = exported(tmp_path / str(seconds), wall, scene, False, frame="capture", seconds=seconds)
+        assert np.median(np.abs(gsply.plyread(path).means[:, 2] + 3.0)) < 0.15
 
 
 def test_panoramas_and_empty_fields_are_refused(tmp_path):

@@ -53,7 +53,7 @@ def test_the_losses_of_experts_by_hand():
     rough = torch.tensor([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]])[target][:, None].expand(-1, 5, 4).clone()
     rough[0] = rough[0].flip(-1)
     found = roughness(Gates(rough, rough, rough), rays, target)
-    # KL((.7 .1 .1 .1) | (.1 .1 .1 .7)), from each neighbour; rays of another target are none.
+    # KL((.7 .1 .1 .1) | (.1 .1 .1 .7)), from each neighbor; rays of another target are none.
     torch.testing.assert_close(found[0], 0.6 * torch.tensor(7.0).log())
     assert float(found[target == 1].abs().max()) < 1e-6
 

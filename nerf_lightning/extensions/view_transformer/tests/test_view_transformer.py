@@ -7,7 +7,9 @@ import torch
 from looking import looking_model, rays_of_views
 from support.scenes import ball_scene
 
+from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.evaluation.evaluator import Scoring
+from nerf_lightning.export.page import PageExport
 from nerf_lightning.extensions.many_scenes.joined import joined
 from nerf_lightning.extensions.view_transformer.nearest_view import NearestViews
 from nerf_lightning.messages.errors import InputError
@@ -99,8 +101,10 @@ def test_what_it_cannot_look_at_or_tell_is_refused_by_name():
         looking_model(ball_scene(), [0, 1, 2], num_sources=4)
     with pytest.raises(InputError, match=r"scene\.background=white"):
         looking_model(ball_scene(background="random"))
-    with pytest.raises(InputError, match="ViewTransformer renders rays and has neither density nor colour"):
+    with pytest.raises(InputError, match="ViewTransformer renders rays and has neither density nor color"):
         point_field(looking_model())
+    with pytest.raises(InputError, match="neither surfaces nor volumes can be exported"):
+        PostTraining(None, None, {"page": PageExport()}).require_density(looking_model())
     for changes in ({"width": 10, "heads": 4}, {"image_scale": 3}, {"experts": 2}, {"blocks": 0}):
         with pytest.raises(ValueError, match=next(reversed(changes))):
             looking_model(**changes)

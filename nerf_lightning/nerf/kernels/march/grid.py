@@ -36,7 +36,7 @@ def blocks_of(cells: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "a b c"]:
 def leaps_over(blocks: UInt8[Tensor, "a b c"]) -> UInt8[Tensor, "a b c"]:
     """Return how far from each block the next occupied one is, in blocks along the axis where it is farthest.
 
-    0 for a block that is occupied, 1 for a neighbour, `FARTHEST` at most.
+    0 for a block that is occupied, 1 for a neighbor, `FARTHEST` at most.
     """
     reached = blocks.float()[None]
     leaps = torch.zeros_like(reached)

@@ -1,7 +1,7 @@
 """March along rays through a grid of occupied cells, and keep the intervals whose middle lies in one.
 
 The intervals of all rays come from one lattice of distances: interval k of a ray begins at
-e[k] + jitter (e[k+1] - e[k]). Cascade c of the grid is the box, enlarged 2^c times about its centre.
+e[k] + jitter (e[k+1] - e[k]). Cascade c of the grid is the box, enlarged 2^c times about its center.
 """
 
 from jaxtyping import Float, Int

@@ -46,7 +46,7 @@ def gather(
     rgba: UInt8[Tensor, "pixels 4"],
     mask: UInt8[Tensor, "pixels"] | None,
 ) -> tuple[Float[Tensor, "*rays 4"], Float[Tensor, "*rays"]]:
-    """Return colours in [0, 1] and weights of pixels; the arrays are those of `PixelStore`."""
+    """Return colors in [0, 1] and weights of pixels; the arrays are those of `PixelStore`."""
     colors = torch.empty(*view.shape, 4, device=rgba.device)
     weight = torch.empty(view.shape, device=rgba.device)
     count = view.numel()

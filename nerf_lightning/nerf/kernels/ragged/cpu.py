@@ -36,7 +36,7 @@ def integrate_gradient(
     weights: Float[Tensor, "n"],
     *grads: Tensor,
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Return the gradients of density and colour, given those of foreground, opacity, depth and weights."""
+    """Return the gradients of density and color, given those of foreground, opacity, depth and weights."""
     out = torch.zeros_like(density), torch.zeros_like(rgb)
     over_rows(
         _gradient,

@@ -62,7 +62,7 @@ def integrate_gradient(
     each: int = 0,
     closed: bool = False,
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Return the gradients of density and colour, given those of the four results."""
+    """Return the gradients of density and color, given those of the four results."""
     of_density, of_rgb = torch.empty_like(density), torch.empty_like(rgb)
     capacity = density.shape[0]
     rays = capacity // each if each else bounds.shape[0] - 1

@@ -21,7 +21,7 @@ BLOCK = 128
 
 
 def takes(cameras: Cameras) -> bool:
-    """Tell whether the kernel knows the lens, and nobody wants gradients or normalised device coordinates."""
+    """Tell whether the kernel knows the lens, and nobody wants gradients or normalized device coordinates."""
     learnt = (cameras.c2w, cameras.focal, cameras.center, cameras.lens)
     known = cameras.lens_model in LENSES and cameras.ndc is None
     return known and all(each.dtype == torch.float32 and not each.requires_grad for each in learnt)
@@ -34,7 +34,7 @@ def rays_through_pixels(
     far: Float[Tensor, "views"],
     per_side: int,
 ) -> RayBundle:
-    """Return the rays through the centres of pixels.
+    """Return the rays through the centers of pixels.
 
     Args:
         cameras: one per view, of which `takes` is true.

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponential
 
 BACK, LIGHT, WEIGHT, SHARE, COLOR, DISTANCE = 0, 1, 2, 3, 4, 7
 """Of each sample: length times slope of the density times SHARE; the light behind it; its weight; the share of its
-gradients that counts (`rendering.near_gradients`); three colours; its distance."""
+gradients that counts (`rendering.near_gradients`); three colors; its distance."""
 LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
 ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
@@ -58,7 +58,7 @@ def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, nu
 @njit
 @no_type_check
 def shade(count, flat, outer, owner, numbers, rooms, foreground):
-    """Add weighted colours to the foreground of each sample's ray, given raw ones; some samples have no owner."""
+    """Add weighted colors to the foreground of each sample's ray, given raw ones; some samples have no owner."""
     raw, shades, _, bits = rooms
     for c in range(3):
         for i in range(count):

@@ -58,7 +58,7 @@ def render(
         state: where each ray's march begins.
         lattice: the intervals (`kernels.march`).
         grid: which of them are asked about.
-        least_alpha: less opaque samples count with their density and without their colour.
+        least_alpha: less opaque samples count with their density and without their color.
         opaque_below: a ray ends where less light than this is left.
         dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
     """
@@ -211,7 +211,7 @@ def _render(kind, first, last, march, world, directions, hidden, table, levels, 
     size, sums = bytes_of(kind), np.zeros((ROWS, dims.max()), np.float32)
     words = np.zeros((ROWS, dims[:-1].sum() * size // 4), np.int32)
     flat, outer = sums.reshape(-1), dims[-1]
-    # Of the samples whose colours are asked for together.
+    # Of the samples whose colors are asked for together.
     inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
     between = np.zeros((ROWS, color_dims[:-1].sum() * size // 4), np.int32)
     colors, given = np.zeros((ROWS, color_dims.max()), np.float32), hidden + directions.shape[1]

@@ -1,7 +1,7 @@
 """Samples to pixels on CUDA: what lies between the large kernels, in one pass each.
 
 The hash grid, the perceptrons and the quadrature have kernels of their own; from rays to their points, from hidden
-features to the inputs of the colour, and from raw numbers to density and colour are functions of single samples, which
+features to the inputs of the color, and from raw numbers to density and color are functions of single samples, which
 plain torch would compute in dozens of passes. `TRITON_INTERPRET=1` runs the kernels without a GPU. The results are the
 same in each run, but for the gradient of the hash grid, which is summed up atomically.
 """
@@ -38,7 +38,7 @@ def render(
     Args:
         rays: unit directions, scene units; one axis.
         samples: where along them.
-        field: table and weights; where it has none of colour, all is black.
+        field: table and weights; where it has none of color, all is black.
         matmul_precision: of the perceptrons' products.
         closed: whether the last sample of a ray takes all the light that is left.
         whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
@@ -108,7 +108,7 @@ def _points(rays: RayBundle, where: _Where, field: FieldParts) -> Float[Tensor, 
 
 
 class _Joined(torch.autograd.Function):
-    """The inputs of the colours: each sample's hidden features, and what its ray's samples share."""
+    """The inputs of the colors: each sample's hidden features, and what its ray's samples share."""
 
     @staticmethod
     def forward(ctx: Any, hidden: Tensor, shared: Tensor, where: _Where) -> Tensor:
@@ -128,7 +128,7 @@ class _Joined(torch.autograd.Function):
 
 
 class _Activated(torch.autograd.Function):
-    """Density and colour of raw numbers (`nerf.activations`); outside of its box a field has no density."""
+    """Density and color of raw numbers (`nerf.activations`); outside of its box a field has no density."""
 
     @staticmethod
     def forward(

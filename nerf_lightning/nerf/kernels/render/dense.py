@@ -44,8 +44,8 @@ from nerf_lightning.nerf.types.rays import RayBundle
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
 BESIDE = 64
-"""Of so many neighbouring rays of a picture the first samples come first, then the second ones: they share the grid's
-cells. A batch's rays are no neighbours, and only the samples of one ray are."""
+"""Of so many neighboring rays of a picture the first samples come first, then the second ones: they share the grid's
+cells. A batch's rays are no neighbors, and only the samples of one ray are."""
 COPY = np.float32(0)
 """Tells `round_vector` to round to float32, which is to copy."""
 
@@ -58,7 +58,7 @@ def render(
     closed: bool,
     whole_from: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
-    """Return the weights of all samples, and per ray sum of w rgb (nothing, for a field without colours).
+    """Return the weights of all samples, and per ray sum of w rgb (nothing, for a field without colors).
 
     Gradients go to the field's table and weights, to the features of directions, and to the rays' origins and
     directions.
@@ -122,13 +122,13 @@ class _Call:
         self.scale, self.offset = 1.0 / side, -low / side - shift
 
     def networks(self, weights: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
-        """Return the words and widths of both perceptrons; no widths where there are no colours."""
+        """Return the words and widths of both perceptrons; no widths where there are no colors."""
         density, color = self.split(weights)
         none = np.zeros(0, np.int32), np.zeros(0, np.int64)
         return (*network(density, self.dtype, transposed), *(network(color, self.dtype, transposed) if color else none))
 
     def split(self, weights: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the weights of the density's perceptron, and of the colours'."""
+        """Return the weights of the density's perceptron, and of the colors'."""
         layers = len(self.field.density_weights)
         return weights[:layers], weights[layers:]
 
@@ -349,7 +349,7 @@ def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of
 @njit
 @no_type_check
 def _composite_back(count, start, first, samples, colored, least_slope, grads, numbers, behind, outer, flat, raw):
-    # Gradients of a block's raw colours, side by side in `flat`, and of its raw densities; from back to front. Returns
+    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front. Returns
     # what lies behind the first of these samples.
     of_weights, of_light = grads
     flat[: ROWS * outer] = ZERO
@@ -378,7 +378,7 @@ def _composite_back(count, start, first, samples, colored, least_slope, grads, n
 @njit
 @no_type_check
 def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
-    # From the gradients of the colours' inputs to those of what the density's perceptron gave, and of what rays share.
+    # From the gradients of the colors' inputs to those of what the density's perceptron gave, and of what rays share.
     flat[: ROWS * outer] = ZERO
     for i in range(count):
         given, to = address(passed) + 4 * i * passed.shape[1], address(flat) + 4 * i * outer

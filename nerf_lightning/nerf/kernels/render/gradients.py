@@ -78,7 +78,7 @@ def render(
     """Return, per ray, sum of w rgb, sum of w, and sum of w t; and how many samples were asked about.
 
     Gradients go to the field's table and weights. The arguments are those of `cpu.render`; every sample counts with its
-    colour.
+    color.
 
     Args:
         rays: unit directions, scene units.
@@ -301,7 +301,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
 @njit
 @no_type_check
 def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
-    # Gradients of a block's raw colours, side by side in `flat`, and of its raw densities; from back to front.
+    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front.
     of_light, of_opacity, of_depth = grads
     flat[: ROWS * outer] = ZERO
     for i in range(ROWS - 1, -1, -1):

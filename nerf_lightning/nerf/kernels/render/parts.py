@@ -12,7 +12,7 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 @dataclass(frozen=True)
 class FieldParts:
-    """A hash grid, and two perceptrons without biases: density, and colour by what that hands on."""
+    """A hash grid, and two perceptrons without biases: density, and color by what that hands on."""
 
     aabb: Float[Tensor, "2 3"]
     """The box, outside of which there is nothing. Where space is contracted, the box whose inside stays as it is."""
@@ -22,18 +22,18 @@ class FieldParts:
     """Added to the raw density, before the exponential."""
     density_weights: list[Tensor]
     color_weights: list[Tensor]
-    """Of the colour's; its inputs are the density's outputs and what a ray's samples share. Empty: density only."""
+    """Of the color's; its inputs are the density's outputs and what a ray's samples share. Empty: density only."""
     ray_features: Callable[[RayBundle], Float[Tensor, "rays features"]]
     """Return what all samples of a ray share: the features of its direction, and a photograph's code."""
     least_slope: float = 0.0
-    """Of a colour over its raw value on the way back from black or full, in training."""
+    """Of a color over its raw value on the way back from black or full, in training."""
     contracted: bool = False
     """Whether all space, contracted around the box, is mapped to the unit cube (`geometry.contraction`)."""
     ray_features_learn: bool = False
     """Whether there is anything to learn in `ray_features`."""
 
     def handed_over(self, shared: int) -> int:
-        """Return how many outputs of the density are inputs of the colours, of which `shared` belong to the ray."""
+        """Return how many outputs of the density are inputs of the colors, of which `shared` belong to the ray."""
         return self.color_weights[0].shape[1] - shared if self.color_weights else 0
 
     @property

@@ -24,7 +24,7 @@ class WholeRays(NamedTuple):
     """What a kernel saw along each ray."""
 
     rgb: Float[Tensor, "rays 3"]
-    """Sum of weights times colour."""
+    """Sum of weights times color."""
     opacity: Float[Tensor, "rays"]
     depth: Float[Tensor, "rays"]
     """Sum of weights times distance."""
@@ -112,7 +112,7 @@ def render_whole_rays(
         march: where each ray stands, and through what it goes.
         matmul_precision: the precision of the field's products.
         opaque_below: a ray ends where less light is left.
-        least_alpha: in rendering, samples less opaque than this have no colour.
+        least_alpha: in rendering, samples less opaque than this have no color.
         samples_per_ray: how many are expected in training; None: render without gradients.
     """
     kernels: Any = cpu_backend(RENDERING if samples_per_ray is None else LEARNING, rays.near.device)
@@ -130,7 +130,7 @@ def render_dense_rays(
     closed: bool,
     whole_from: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
-    """Render rays with the kernel that `has_dense_kernel` found; return all weights, and sums of weights times colour.
+    """Render rays with the kernel that `has_dense_kernel` found; return all weights, and sums of weights times color.
 
     Args:
         rays: unit directions.

@@ -1,0 +1,46 @@
+"""What a step asks of a GPU is counted on a stand-in, and may only become less; what the kernels compute is torch's.
+
+Three steps of each model, every kernel of triton's in its place, through triton's interpreter.
+"""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("triton", reason="triton is not installed (Linux only)")
+
+BUDGETS = {
+    # On the device (operations and kernels): a step, a rendered tile. On the host: a step.
+    "fast_small,bf16-mixed": (83, 38, 7),
+    "fast_proposal,bf16-mixed": (132, 33, 7),
+    "nerf_tiny,bf16-mixed": (312, 120, 9),
+    "fast,bf16-mixed": (83, 38, 7),
+    "fast,32-true": (93, 42, 7),
+    "fast_proposal,32-true": (152, 41, 7),
+}
+QUICK = list(BUDGETS)[:3]
+CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
+# How far losses may be apart after up to two steps: bfloat16 has 8 bits, and Adam's first steps follow signs.
+TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}
+
+
+def measured(case):
+    """In a process of its own: the interpreter is chosen when the kernels are defined."""
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
+    command = [sys.executable, "-m", "support.launches", case]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)[case]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
+    found, precision = measured(case), case.split(",")[1]
+    assert found["step"]["kernels"] > 0
+    assert found["losses"] == pytest.approx(found["without"], rel=TOLERANCE[precision])
+    counted = *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "tile")), found["step"]["host"]
+    print(f'    "{case}": {counted},')  # pytest -rP shows the table anew
+    assert all(asked <= budget for asked, budget in zip(counted, BUDGETS[case], strict=True)), (counted, BUDGETS[case])
