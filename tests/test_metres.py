@@ -38,7 +38,7 @@ def test_a_reader_says_it_a_checkpoint_keeps_it_and_lengths_are_told_in_metres_w
     assert kept["metres_per_unit"] == 2.5
     for nothing in (0.0, -1.0, float("nan"), float("inf")):
         refused(partial(read, metres_per_unit=nothing), "colmap", root, parts=("scene.metres_per_unit=", "0.01 for"))
-    assert told_length(record()) == (pytest.approx(0.5), "metres")
+    assert told_length(record()) == (pytest.approx(0.5), "meters")
     assert told_length(record(None)) == (pytest.approx(UNIT), "the capture's units")
 
 

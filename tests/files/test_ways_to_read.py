@@ -15,6 +15,7 @@ OURS = {
     "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
     "cli/process.py": ["print", "open"],
+    "__init__.py": ["read_text"],
     "cli/help.py": ["read_text"],
     "config/manual/docstrings.py": ["read_text"],
     "config/manual/search.py": ["read_text"],

@@ -98,6 +98,7 @@ def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.eye(3).to(up) + skew + skew @ skew / (1.0 + cosine)
 
 
+@disable_autocast
 def y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
     """Return the rotation that takes `up` (unit) to +y, as glTF has it, and what a frame with z up calls x to x.
 
@@ -181,4 +182,4 @@ def told_length(record: SceneRecord) -> tuple[float, str]:
     unit = unit_of(record.to_user.double())
     if record.metres_per_unit is None:
         return unit, "the capture's units"
-    return unit * record.metres_per_unit, "metres"
+    return unit * record.metres_per_unit, "meters"

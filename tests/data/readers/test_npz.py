@@ -73,7 +73,7 @@ def test_downscale_moves_every_projected_point_with_the_pixels(path):
         ({"downscale": -1}, r"scene.downscale is -1, but it must be 1"),
         ({"downscale": 4}, r"downscale=4 does not divide .* 6 x 4 pixels. Choose one of 1, 2\."),
         ({"near": 7.0}, r"scene.near is 7.0 and scene.far is 6.0"),
-        ({"background": "grey"}, r"scene.background is 'gray'"),
+        ({"background": "grey"}, r"scene.background is 'grey'"),
         ({"hold_every": -2}, r"scene.hold_every is -2, but it must be 0"),
         ({"hold_every": 1}, r"leaves 0 to learn from and 10 to judge by"),
         ({"train_fraction": 1.0}, r"leaves 10 to learn from and 0 to judge by"),
