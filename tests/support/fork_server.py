@@ -47,8 +47,8 @@ COMPOSED = (("train", "scene=npz", "model=nerf_tiny"), ("train", "scene=npz", "m
 NOT_IMPORTED = ("__main__", "_triton")
 # The one of them that a fork can make up for.
 UNBUFFERED = "PYTHONUNBUFFERED"
-# `nerf` sets it before it loads torch, also where a test has called it in this very process.
-SET_BY_NERF = {"GOMP_SPINCOUNT": "1000"}
+# `nerf` sets these before it loads torch, or triton, also where a test has called it in this very process.
+SET_BY_NERF = {"GOMP_SPINCOUNT": "1000", "TRITON_DEFAULT_FP_FUSION": "1"}
 LARGEST_REQUEST = 1 << 20
 
 
