@@ -62,6 +62,8 @@ def rendered(file):
 
 @pytest.mark.parametrize("file", sorted(KEPT.glob("*/*.ckpt")), ids=lambda file: f"{file.parent.name}-{file.stem}")
 def test_a_checkpoint_of_a_released_version_renders_as_it_did(file):
+    if file.stem == "view_transformer":
+        pytest.importorskip("nerf_lightning.extensions.view_transformer", reason="an extension, which is not here")
     expected = json.loads((file.parent / "rendered.json").read_text())[file.stem]
     assert rendered(file) == pytest.approx(expected, abs=2e-3)
 
