@@ -166,20 +166,20 @@ def build_run(
 ) -> StepwiseRun:
     """Build what `nerf train OVERRIDES` trains, for `run.steps(n)` or `Trainer.fit(run.system, run.data)`.
 
-    Nothing is written. The weights are functions of the seed. A run is fitted once; to go on from a checkpoint, another
-    is built.
+    Nothing is written. The weights depend only on the seed. A run is fitted once; to resume from a checkpoint, build
+    another.
 
     Args:
-        *overrides: as on the command line, like "scene=bricks" and "model=nerf_tiny".
-        scene: of `Scene.from_cameras` or `nl.read`, in the place of the config's.
-        model: one of your own in the place of the config's; its weights are drawn anew from the seed. A checkpoint of
-            it is opened by whoever builds it again, as here, with `ckpt_path`, and not by the commands.
-        loss: one of your own in the place of the config's.
-        resume: a checkpoint, or a run folder, that `run.steps` goes on from; overrides and scene are given again. On a
+        *overrides: settings as on the command line, such as "scene=bricks" and "model=nerf_tiny".
+        scene: from `Scene.from_cameras` or `nl.read`, instead of the config's.
+        model: your own model instead of the config's; its weights are drawn anew from the seed. Its checkpoints are
+            opened by building it again, as here, with `ckpt_path`, and not by the commands.
+        loss: your own loss instead of the config's.
+        resume: a checkpoint, or a run folder, that `run.steps` resumes; give the overrides and the scene again. On a
             CPU the weights are then, bit for bit, those of a run that was never stopped.
 
     Raises:
-        InputError: anything in the settings or in the capture that makes no run, or a setting of Lightning's Trainer.
+        InputError: a setting or the capture is invalid, or a setting belongs to Lightning's Trainer.
     """
     _refuse_settings_of_the_trainer(overrides)
     overrides = of_scene(scene, overrides)

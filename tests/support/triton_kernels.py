@@ -74,16 +74,23 @@ def check_spherical_harmonics(kernels, device, generator, rays):
         assert kernels.spherical_harmonics(directions[:0].to(device), degree).shape == (0, degree**2)
 
 
-def a_march(device, generator, count, share, resolution=16):
+SOLID = -1.0
+
+
+def a_march(device, generator, count, share, resolution=16, step=0.05):
     aabb = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
     origins = 4.0 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     aim = 0.8 * torch.randn(count, 3, generator=generator)
     directions = torch.nn.functional.normalize(aim - origins, dim=-1)
     rays = RayBundle(origins, directions, torch.full((count,), 2.0), torch.full((count,), 6.0), directions)
-    cells = (torch.rand(resolution, resolution, resolution, generator=generator) < share).to(torch.uint8)
+    cells = torch.rand(resolution, resolution, resolution, generator=generator) < share
+    if share == SOLID:  # a ball with nothing around it, which leaps lead up to
+        axis = torch.linspace(-1.0, 1.0, resolution)
+        cells = torch.cartesian_prod(axis, axis, axis).norm(dim=-1).view(cells.shape) < 0.7
+    cells = cells.to(torch.uint8)
     jitter = torch.rand(count, generator=generator)
     state = MarchState(*distances_in_box(rays, aabb), jitter, torch.zeros(count, dtype=torch.long))
-    lattice = 1.9 + 0.05 * torch.arange(86)
+    lattice = 1.9 + step * torch.arange(round(4.3 / step))
     return *(each.to(device) for each in (rays, state, lattice)), OccupancyCells(
         aabb.to(device), cells.to(device), leaps_over(blocks_of(cells)).to(device)
     )
@@ -91,8 +98,9 @@ def a_march(device, generator, count, share, resolution=16):
 
 def check_march(kernels, device, generator, rays):
     cases = [(share, limit, capacity) for share in (0.0, 0.03, 1.0) for limit, capacity in ((None, 4000), (5, None))]
-    for share, limit, capacity in [*cases, (0.5, None, 100), (0.5, None, None)]:
-        given = a_march(device, generator, rays, share)
+    for share, limit, capacity in [*cases, (0.5, None, 100), (0.5, None, None), (SOLID, None, None)]:
+        fine = {"resolution": 64, "step": 0.01} if share == SOLID else {}
+        given = a_march(device, generator, rays, share, **fine)
         for one, other in zip(
             kernels.distances_in_box(given[0], given[3].aabb), (given[1].enter, given[1].leave), strict=True
         ):
@@ -197,6 +205,7 @@ def check_render(kernels, device, generator, rays):
             for parameter in field.parameters():
                 parameter.data.uniform_(-0.5, 0.5, generator=generator)
             field.aabb.copy_(1.5 * torch.tensor([[-1.0] * 3, [1.0] * 3]))
+            field.color_mlp[-1].data *= 30.0  # some colors are nearly black, or full
             field.least_slope = 0.003
             field.to(device)
             origins = torch.tensor([0.0, 0.0, -2.0]) + 0.5 * torch.randn(rays, 3, generator=generator)

@@ -11,7 +11,7 @@ from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
-from nerf_lightning.nerf.rendering.quadrature import composite, dense_rendering, rendering_of
+from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -73,7 +73,8 @@ class DenseLevel(Level):
         parts = None if plain else self._parts_on(rays.near.device)
         integrated = render_samples(rays, samples, parts, self.field.matmul_precision, background is None, whole_from)
         if integrated is not None:
-            return dense_rendering(integrated, samples, rays, background)
+            *sums, weights = integrated
+            return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
         if parts is not None and rays.near.device.type == "cpu":
             weights, foreground = render_dense_rays(
                 rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from

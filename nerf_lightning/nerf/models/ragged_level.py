@@ -15,12 +15,12 @@ from nerf_lightning.nerf.kernels.render.whole_rays import (
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged, ragged_rendering
+from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler, Sampler
 from nerf_lightning.nerf.samplers.early_termination import LEAST_ALPHA, render_until_opaque, visible_samples
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
-from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.renderings import RaggedRendering, Rendering
 
 MOST_SAMPLES = 1 << 22
 """That are rendered at once: their features take a gigabyte and a half."""
@@ -82,7 +82,10 @@ class RaggedLevel(Level):
     ) -> Rendering | None:
         """Render samples with the kernels for CUDA; None where they do not do all that is asked for."""
         integrated = render_samples(rays, samples, self.field.parts(), self.field.matmul_precision)
-        return None if integrated is None else ragged_rendering(integrated, samples, rays, background)
+        if integrated is None:
+            return None
+        *sums, weights = integrated
+        return RaggedRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether a kernel takes rays from end to end: in training without weights and gradients of rays."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.ragged.integrate import Integrated, integrate_dense
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate_dense
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
@@ -54,31 +54,17 @@ def composite(
         rays: where near and far stand.
         background: color behind each ray; None closes the ray instead.
     """
-    integrated = integrate_dense(output.density, output.rgb, samples.edges, closed=background is None)
-    if integrated is not None and not output.channels:
-        return dense_rendering(integrated, samples, rays, background)
+    closed = background is None
+    integrated = None if output.channels else integrate_dense(output.density, output.rgb, samples.edges, closed)
+    if integrated is not None:
+        *sums, weights = integrated
+        return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
     weights = weights_from_density(output.density, samples.deltas)
-    if background is None:
+    if closed:
         weights = closed_weights(weights)
     foreground = (weights[..., None] * output.rgb).sum(dim=-2)
     channels = {name: (weights[..., None] * each).sum(dim=-2) for name, each in output.channels.items()}
     return rendering_of(weights, foreground, samples, rays, background, channels)
-
-
-def dense_rendering(
-    integrated: Integrated, samples: RaySamples, rays: RayBundle, background: Float[Tensor, "*#rays 3"] | None
-) -> DenseRendering:
-    """Return what is seen, given the sums along each ray; the other arguments are those of `composite`."""
-    foreground, opacity, depth, weights = integrated
-    escaped = 1.0 - opacity
-    return DenseRendering(
-        rgb=foreground if background is None else foreground + escaped[..., None] * background,
-        foreground=foreground,
-        opacity=opacity,
-        depth=depth if background is None else depth + escaped * rays.far,
-        weights=weights,
-        samples=samples,
-    )
 
 
 def rendering_of(
@@ -90,14 +76,6 @@ def rendering_of(
     channels: dict[str, Tensor] | None = None,
 ) -> DenseRendering:
     """Return what is seen, given the weights and sum of w rgb; the other arguments are those of `composite`."""
-    opacity = weights.sum(dim=-1)
-    escaped = 1.0 - opacity
-    return DenseRendering(
-        rgb=foreground if background is None else foreground + escaped[..., None] * background,
-        foreground=foreground,
-        opacity=opacity,
-        depth=(weights * samples.midpoints).sum(dim=-1) + escaped * rays.far,
-        weights=weights,
-        samples=samples,
-        channels=channels or {},
-    )
+    opacity, depth = weights.sum(dim=-1), (weights * samples.midpoints).sum(dim=-1)
+    of_the_kind = {"weights": weights, "samples": samples, "channels": channels or {}}
+    return DenseRendering.from_sums(rays, background, foreground, opacity, depth, **of_the_kind)

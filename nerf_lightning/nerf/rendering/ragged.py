@@ -1,12 +1,12 @@
 """Volume rendering of ragged samples: the quadrature of `rendering.quadrature`, in the other layout."""
 
-from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.ragged.integrate import Integrated, integrate
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, RaggedRendering
 
@@ -25,26 +25,10 @@ def composite_ragged(
         rays: where far stands.
         background: color behind each ray; None leaves the rays open in front of black.
     """
-    rendering = ragged_rendering(integrate(output.density, output.rgb, samples), samples, rays, background)
-    weights = rendering.weights[:, None]
-    channels = {name: sum_over_rays(weights * each, samples) for name, each in output.channels.items()}
-    return replace(rendering, channels=channels) if channels else rendering
-
-
-def ragged_rendering(
-    integrated: Integrated, samples: RaggedSamples, rays: RayBundle, background: Float[Tensor, "rays 3"] | None
-) -> RaggedRendering:
-    """Return what is seen, given the sums along each ray; the other arguments are those of `composite_ragged`."""
-    foreground, opacity, depth, weights = integrated
-    escaped = 1.0 - opacity
-    return RaggedRendering(
-        rgb=foreground if background is None else foreground + escaped[:, None] * background,
-        foreground=foreground,
-        opacity=opacity,
-        depth=depth + escaped * rays.far,
-        weights=weights,
-        samples=samples,
-    )
+    *sums, weights = integrate(output.density, output.rgb, samples)
+    channels = {name: sum_over_rays(weights[:, None] * each, samples) for name, each in output.channels.items()}
+    of_the_kind: dict[str, Any] = {"weights": weights, "samples": samples, "channels": channels}
+    return RaggedRendering.from_sums(rays, background, *sums, **of_the_kind)
 
 
 def sum_over_rays(values: Float[Tensor, "capacity n"], samples: RaggedSamples) -> Float[Tensor, "rays n"]:

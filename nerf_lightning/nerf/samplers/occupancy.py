@@ -10,7 +10,6 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.kernels.backends import cuda_backend
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
@@ -165,8 +164,7 @@ class OccupancySampler(RaggedSampler):
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> MarchState:
         """Return the beginning of a march along rays."""
-        kernels = cuda_backend("march.cuda", rays.near.device)
-        enter, leave = (distances_in_box if kernels is None else kernels.distances_in_box)(rays, self.grid.aabb)
+        enter, leave = distances_in_box(rays, self.grid.aabb)
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
         return MarchState(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 

@@ -1,12 +1,15 @@
 """What a field says of points, and what a level makes of it along each ray."""
 
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+Kind = TypeVar("Kind", bound="Rendering")
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,29 @@ class Rendering(TensorStruct):
     """What a level in training adds to the loss of each ray, whatever the loss; None: nothing."""
     channels: dict[str, Float[Tensor, "*rays _"]] = field(default_factory=dict, kw_only=True)
     """The field's channels, composited like color over nothing: sums of weights times values."""
+
+    @classmethod
+    def from_sums(
+        cls: type[Kind],
+        rays: RayBundle,
+        background: Float[Tensor, "*#rays 3"] | None,
+        foreground: Float[Tensor, "*rays 3"],
+        opacity: Float[Tensor, "*rays"],
+        depth: Float[Tensor, "*rays"],
+        **of_the_kind: Any,
+    ) -> Kind:
+        """Return what is seen, given per ray sum of w rgb, sum of w and sum of w t, and the fields of its class.
+
+        Light that escapes belongs to the background and, in the depth, to far.
+        """
+        escaped = 1.0 - opacity
+        return cls(
+            rgb=foreground if background is None else foreground + escaped[..., None] * background,
+            foreground=foreground,
+            opacity=opacity,
+            depth=depth + escaped * rays.far,
+            **of_the_kind,
+        )
 
     @classmethod
     def from_light(

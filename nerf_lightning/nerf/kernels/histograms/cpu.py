@@ -3,6 +3,7 @@
 Letters as in `rendering.histograms` and `losses.proposal`, whose functions these are in one pass over each ray.
 """
 
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import numpy as np
@@ -12,6 +13,7 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
+from nerf_lightning.nerf.kernels.histograms.ray_loss import RayLoss
 from nerf_lightning.nerf.kernels.threads import over_rows
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -39,14 +41,14 @@ def interlevel(
     v: Float[Tensor, "rays bins"],
 ) -> Float[Tensor, "rays"]:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
-    return _Loss.apply(_interlevel, (), v, *(each.detach().contiguous() for each in (t, w, u)))
+    return RayLoss.apply(_over_rays(_interlevel), v, t, w, u)
 
 
 def distortion(
     edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"], contracted: bool
 ) -> Float[Tensor, "rays"]:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
-    return _Loss.apply(_distortion, (contracted,), w, edges.detach().contiguous())
+    return RayLoss.apply(_over_rays(_distortion, contracted), w, edges)
 
 
 def trial() -> None:
@@ -57,23 +59,11 @@ def trial() -> None:
     distortion(edges, weights, True)
 
 
-class _Loss(torch.autograd.Function):
-    """A number per ray whose gradient for some weights is found with it."""
+def _over_rays(kernel: Any, *flags: bool) -> Callable[..., None]:
+    def compute(*arrays: Tensor) -> None:
+        over_rows(kernel, len(arrays[0]), *flags, *(each.numpy() for each in arrays))
 
-    @staticmethod
-    def forward(ctx: Any, kernel: Any, flags: tuple[bool, ...], weights: Tensor, *given: Tensor) -> Tensor:
-        weights = weights.contiguous()
-        out, grad = weights.new_empty(len(weights)), torch.empty_like(weights)
-        arrays = (each.numpy() for each in (weights, *given, out, grad))
-        over_rows(kernel, len(weights), *flags, *arrays)
-        ctx.save_for_backward(grad)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-        (own,) = ctx.saved_tensors
-        return None, None, own * grad[:, None], *[None] * (len(ctx.needs_input_grad) - 3)
+    return compute
 
 
 @njit

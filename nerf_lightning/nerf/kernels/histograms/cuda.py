@@ -4,6 +4,7 @@ Letters as in `rendering.histograms` and `losses.proposal`. The results are the 
 `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import torch
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
+from nerf_lightning.nerf.kernels.histograms.ray_loss import RayLoss
 
 LANES = 32
 """Samples that are looked for in all bins at a time."""
@@ -44,14 +46,14 @@ def interlevel(
     v: Float[Tensor, "rays bins"],
 ) -> Float[Tensor, "rays"]:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
-    return _Loss.apply(_interlevel, (), v, t, w, u)
+    return RayLoss.apply(_on_rays(_interlevel), v, t, w, u)
 
 
 def distortion(
     edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"], contracted: bool
 ) -> Float[Tensor, "rays"]:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
-    return _Loss.apply(_distortion, (contracted,), w, edges)
+    return RayLoss.apply(_on_rays(_distortion, contracted), w, edges)
 
 
 def trial(device: str = "cuda") -> None:
@@ -64,26 +66,13 @@ def trial(device: str = "cuda") -> None:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 
-class _Loss(torch.autograd.Function):
-    """A number per ray whose gradient for some weights is found with it."""
+def _on_rays(kernel: Any, *flags: bool) -> Callable[..., None]:
+    def compute(*arrays: Tensor) -> None:
+        (rays, bins), samples = arrays[0].shape, arrays[1].shape[1] - 1  # of weights, and between edges
+        block = triton.next_power_of_2(bins)
+        kernel[(rays,)](*arrays, bins, samples, *flags, block, LANES, num_warps=_warps(block))
 
-    @staticmethod
-    def forward(ctx: Any, kernel: Any, flags: tuple[bool, ...], weights: Tensor, *given: Tensor) -> Tensor:
-        weights, given = weights.contiguous(), tuple(each.detach().contiguous() for each in given)
-        out, grad = weights.new_empty(len(weights)), torch.empty_like(weights)
-        bins, samples = weights.shape[1], (given[1] if len(given) > 1 else weights).shape[1]
-        if out.numel():
-            block = triton.next_power_of_2(bins)
-            sizes = bins, samples, *flags, block, LANES
-            kernel[(len(weights),)](weights, *given, out, grad, *sizes, num_warps=_warps(block))
-        ctx.save_for_backward(grad)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-        (own,) = ctx.saved_tensors
-        return None, None, own * grad[:, None], *[None] * (len(ctx.needs_input_grad) - 3)
+    return compute
 
 
 def _warps(block: int) -> int:

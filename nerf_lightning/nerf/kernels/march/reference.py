@@ -1,4 +1,4 @@
-"""The march in plain torch: every interval of the lattice is looked up. The reference, and what runs on GPUs."""
+"""The march in plain torch: every interval of the lattice is looked up. The reference."""
 
 import torch
 from jaxtyping import Bool, Float, Int

@@ -1,4 +1,4 @@
-"""Rendering of ragged samples in plain torch: the reference, and what runs on GPUs."""
+"""Rendering of ragged samples in plain torch: the reference, and what runs without kernels."""
 
 import torch
 from jaxtyping import Float
