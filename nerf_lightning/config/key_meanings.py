@@ -9,7 +9,6 @@ but the person at the command line; a new reader, field, loss or callback has th
 holds: a setting of a trusted group that says where to write, what to fetch or how far to trust needs one of its own.
 """
 
-import copy
 import hashlib
 import json
 import os
@@ -17,10 +16,6 @@ import re
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Any
-
-from omegaconf import DictConfig, OmegaConf
-
-from nerf_lightning.config.overrides import flatten
 
 WORD = re.compile(r"\w[\w-]*", re.ASCII)
 
@@ -179,18 +174,6 @@ def names_a_class(key: str) -> bool:
     return any(word.startswith("_") for word in key.split("."))
 
 
-def run_identity(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    return {key: value for key, value in flatten(config).items() if meaning_of(key).identity}
-
-
 def fingerprint(identity: dict[str, Any]) -> str:
     """Return a short name of an identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def settings_digest(config: DictConfig) -> str:
-    """Return a short name of everything that a run does, its length and its evaluation included."""
-    resolved = copy.deepcopy(config)
-    OmegaConf.resolve(resolved)
-    return fingerprint({key: value for key, value in flatten(resolved).items() if meaning_of(key).outcome})

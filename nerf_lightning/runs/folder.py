@@ -27,7 +27,7 @@ from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_c
 from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
-from nerf_lightning.config.key_meanings import fingerprint, run_identity, settings_digest
+from nerf_lightning.config.key_meanings import fingerprint
 from nerf_lightning.config.overrides import key_of, to_type
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
@@ -37,6 +37,7 @@ from nerf_lightning.files.regular import open_to_append
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import EscapingFormatter
+from nerf_lightning.runs.identity import run_identity, settings_digest
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 
 log = logging.getLogger(__name__)

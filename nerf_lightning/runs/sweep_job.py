@@ -17,11 +17,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerf_lightning.compute.slurm import was_requeued
-from nerf_lightning.config.key_meanings import settings_digest
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.files.regular import read_text
+from nerf_lightning.runs.identity import settings_digest
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 
 NUM_JOBS = "NERF_LIGHTNING_JOBS"  # In the environment of the jobs: how many there are

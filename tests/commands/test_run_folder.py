@@ -11,10 +11,10 @@ from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
-from nerf_lightning.config.key_meanings import settings_digest
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
+from nerf_lightning.runs.identity import settings_digest
 
 HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}
 

@@ -10,8 +10,8 @@ from support.running import refused
 
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.key_meanings import run_identity, settings_digest
 from nerf_lightning.config.overrides import open_sections
+from nerf_lightning.runs.identity import run_identity, settings_digest
 from nerf_lightning.training.launch.lightning_flags import OWNED, passed_through
 from nerf_lightning.training.launch.trainer import TrainerSettings
 

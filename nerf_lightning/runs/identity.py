@@ -1,0 +1,21 @@
+"""Which runs are the same run: the settings that decide, and short names of them."""
+
+import copy
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.config.key_meanings import fingerprint, meaning_of
+from nerf_lightning.config.overrides import flatten
+
+
+def run_identity(config: DictConfig) -> dict[str, Any]:
+    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
+    return {key: value for key, value in flatten(config).items() if meaning_of(key).identity}
+
+
+def settings_digest(config: DictConfig) -> str:
+    """Return a short name of everything that a run does, its length and its evaluation included."""
+    resolved = copy.deepcopy(config)
+    OmegaConf.resolve(resolved)
+    return fingerprint({key: value for key, value in flatten(resolved).items() if meaning_of(key).outcome})
