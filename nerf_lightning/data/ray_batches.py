@@ -238,10 +238,10 @@ class RayBatches:
             numbers = rays_of_few_views(starts, sizes, position // count, mine, count, self.views, key)
             return domain.locate(sent(numbers, domain.ends.device))
         places = range(position + slots.start, position + slots.stop)
-        numbers, keys = self._in_order(places, len(domain), attempt, purpose)
-        # Each epoch has its own grid of squares, so that no pixel always lies at a border.
-        device = domain.ends.device
-        pixels = domain.locate(sent(numbers, device), sent(keys % self.patch, device) if self.patch > 1 else 0)
+        shift: Tensor | int = 0
+        if self.patch > 1:  # each epoch has its own grid of squares, so that no pixel always lies at a border
+            shift = sent(self._epoch_keys(places, len(domain), attempt, purpose) % self.patch, domain.ends.device)
+        pixels = domain.locate(self._in_order(places, len(domain), attempt, purpose), shift)
         if self.depths is None:
             return pixels
         return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
@@ -253,8 +253,7 @@ class RayBatches:
         before = self._num_depths(position)
         first = count - (self._num_depths(position + count) - before)
         places = range(before + max(slots.start - first, 0), before + max(slots.stop - first, 0))
-        numbers, _ = self._in_order(places, len(self.depths), attempt, "depths")
-        return sent(numbers, self.whole.ends.device)
+        return self._in_order(places, len(self.depths), attempt, "depths")
 
     def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, range]:
         """Return how many squares came before, how many the batch has, and which of them are this process's."""
@@ -265,19 +264,23 @@ class RayBatches:
         """Return how many of the first squares of a run have a pixel of known distance."""
         return 0 if self.depths is None else squares // self.depth_every
 
-    def _in_order(
-        self, positions: range, size: int, attempt: int, purpose: str
-    ) -> tuple[Int[Tensor, "squares"], Int[Tensor, "*#squares"]]:
-        """Return what stands at each position, every number below `size` once an epoch, and the keys of the epochs.
+    def _in_order(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "squares"]:
+        """Return what stands at each position, every number below `size` once an epoch, where the pixels are."""
+        device = self.whole.ends.device
+        kernels = cuda_backend("random.cuda", device)
+        if kernels is not None:
+            key = fold(self.seed, attempt, purpose)
+            return kernels.in_order(positions.start, len(positions), size, key, device)
+        keys = self._epoch_keys(positions, size, attempt, purpose)
+        return sent(permute(torch.arange(positions.start, positions.stop) % size, size, keys), device)
 
-        There is one key where all positions lie in one epoch.
-        """
-        position = torch.arange(positions.start, positions.stop)
+    def _epoch_keys(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "*#squares"]:
+        """Return the key of each position's epoch; one, where all lie in the same."""
         epochs = range(positions.start // size, max(positions.stop - 1, positions.start) // size + 1)
         keys = torch.tensor([fold(self.seed, attempt, purpose, epoch) for epoch in epochs])
         if len(epochs) > 1:
-            keys = keys[position // size - epochs.start]
-        return permute(position % size, size, keys), keys
+            keys = keys[torch.arange(positions.start, positions.stop) // size - epochs.start]
+        return keys
 
 
 class FixedRays:

@@ -123,8 +123,7 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     >>> torch.equal(permute(torch.arange(10), 10, torch.full((10,), 7)).sort().values, torch.arange(10))
     True
     """
-    rows = max(1, int(size**0.5))
-    columns = -(-size // rows)
+    rows, columns = grid_of(size)
     kernels = cpu_backend("random.cpu", index.device) if key.numel() == 1 and index.dim() == 1 else None
     if kernels is not None:
         return kernels.permute(index, rows, columns, size, _round_words(int(key)))
@@ -132,6 +131,12 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
         position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
     return position
+
+
+def grid_of(size: int) -> tuple[int, int]:
+    """Return rows and columns of the cells that a permutation of range(size) walks through."""
+    rows = max(1, int(size**0.5))
+    return rows, -(-size // rows)
 
 
 def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:

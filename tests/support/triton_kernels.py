@@ -18,7 +18,7 @@ from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, b
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
-from nerf_lightning.nerf.randomness import batch_random, purpose_word
+from nerf_lightning.nerf.randomness import batch_random, fold, permute, purpose_word
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import closed_weights, weights_from_density
@@ -43,6 +43,12 @@ def check_random(kernels, device, generator, rays):
     for count in (1, 3, 65):
         expected = random.along(count).uniform("strata")
         assert torch.equal(kernels.uniform(random.key, random.slots, purpose_word("strata"), count), expected)
+    for first, size in ((0, 1), (7, 3 * rays + 1), ((1 << 33) + 5, 97)):  # within an epoch, and across some
+        place = torch.arange(first, first + rays)
+        keys = torch.tensor([fold(3, "rays", epoch) for epoch in (place // size).tolist()])
+        found = kernels.in_order(first, rays, size, fold(3, "rays"), device)
+        assert torch.equal(found.cpu(), permute(place % size, size, keys))
+    assert kernels.in_order(5, 0, 3, 1, device).shape == (0,)
 
 
 def check_adam(kernels, device, generator, rays):
@@ -109,11 +115,12 @@ def check_march(kernels, device, generator, rays):
         expected, expected_following = march_torch(*given, limit, capacity)
         assert found.longest == expected.longest
         counts = [samples.bounds.diff() for samples in (found, expected)]
-        if not torch.equal(*counts):  # a midpoint on a cell's face, to the last bit, may fall to either side
-            assert int((counts[0] != counts[1]).sum()) <= 1
+        # A midpoint on a cell's face, to the last bit, may fall to either side.
+        other = int((counts[0] != counts[1]).sum()), abs(int(found.found) - int(expected.found))
+        if any(other):
+            assert max(other) <= 1 + rays // 1000
             continue
         assert torch.equal(following, expected_following)
-        assert int(found.found) == int(expected.found)
         assert torch.equal(found.ray_index, expected.ray_index)
         torch.testing.assert_close(found.starts, expected.starts)
         torch.testing.assert_close(found.ends, expected.ends)
@@ -121,12 +128,12 @@ def check_march(kernels, device, generator, rays):
 
 def some_ragged_samples(device, generator, rays, padding):
     counts = torch.randint(0, 90, (rays,), generator=generator)
-    counts[0], counts[1], counts[2] = 0, 1, 32
+    counts[-3:] = torch.tensor([0, 1, 32])[-rays:]
     bounds = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     total = int(bounds[-1])
     index = torch.cat([torch.arange(rays).repeat_interleave(counts), torch.arange(padding) % rays])
     length = torch.cat([0.1 * torch.rand(total, generator=generator), torch.zeros(padding)])
-    starts = 2.0 + torch.arange(total + padding) * 0.01
+    starts = 2.0 + torch.arange(total + padding) % 100 * 0.01
     parts = index, starts, starts + length, bounds, bounds[-1]
     return RaggedSamples(*(each.to(device) for each in parts), longest=90)
 
@@ -135,7 +142,7 @@ def check_ragged(kernels, device, generator, rays):
     samples = some_ragged_samples(device, generator, rays, padding=77)
     capacity, total = samples.starts.shape[0], int(samples.found)
     density = torch.exp(3.0 * torch.randn(capacity, generator=generator))
-    density[5], density[40] = 0.0, 1e13  # empty, and so dense that nothing is seen behind it
+    density[5], density[20] = 0.0, 1e13  # empty, and so dense that nothing is seen behind it
     density, rgb = density.to(device), torch.rand(capacity, 3, generator=generator).to(device)
     leaves = [each.double().requires_grad_() for each in (density, rgb)]
     double = samples.map(lambda each: each.double() if each.is_floating_point() else each)
@@ -184,7 +191,7 @@ def _check_losses(kernels, outer, v, inner, contracted, generator):
         expected.backward(grad.double())
         values.backward(grad)
         torch.testing.assert_close(values.double(), expected, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(single.grad.double(), double.grad, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(single.grad.double(), double.grad, rtol=1e-4, atol=1e-4)
 
 
 def rendering(edges, weights, contracted=False):

@@ -58,7 +58,7 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
     much, but what the last level sees must lie within it. Only the proposal receives gradients.
     """
     weights, edges = last.weights.detach(), last.samples.edges.detach()
-    kernels = _kernels_for(weights)
+    kernels = _kernels_for(weights, proposal.weights)
     if kernels is not None:
         return kernels.interlevel(edges, weights, proposal.samples.edges, proposal.weights)
     bound = outer_weights(edges, proposal.samples.edges.detach(), proposal.weights)
@@ -102,7 +102,7 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     return pairs + own
 
 
-def _kernels_for(weights: Tensor) -> Any:
+def _kernels_for(*weights: Tensor) -> Any:
     # Everything else takes the plain way, which is the reference.
-    suits = weights.dim() == 2 and weights.dtype == torch.float32
-    return backend_for("histograms", weights.device) if suits else None
+    suits = all(each.dim() == 2 and each.dtype == torch.float32 for each in weights)
+    return backend_for("histograms", weights[0].device) if suits else None

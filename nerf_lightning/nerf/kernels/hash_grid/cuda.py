@@ -28,7 +28,15 @@ def forward(
     out = torch.empty(points.shape[0], levels * features, device=points.device)
     if points.shape[0]:
         grid = (triton.cdiv(points.shape[0], BLOCK), levels)
-        where = *_levels(layout, points.device), out, points.shape[0], levels, features, BLOCK
+        where = (
+            *_levels(layout, points.device),
+            out,
+            points.shape[0],
+            levels,
+            features,
+            triton.next_power_of_2(features),
+            BLOCK,
+        )
         _forward[grid](table, points, *where, enable_fp_fusion=True)
     return out
 
@@ -43,7 +51,15 @@ def add_table_gradient(
     levels, features = len(layout.resolutions), into.shape[1]
     if points.shape[0]:
         grid = (triton.cdiv(points.shape[0], BLOCK), levels)
-        where = *_levels(layout, points.device), grad, points.shape[0], levels, features, BLOCK
+        where = (
+            *_levels(layout, points.device),
+            grad,
+            points.shape[0],
+            levels,
+            features,
+            triton.next_power_of_2(features),
+            BLOCK,
+        )
         _backward[grid](into, points, *where, enable_fp_fusion=True)
 
 
@@ -124,6 +140,17 @@ def _corner(corner: tl.constexpr, x, y, z, fx, fy, fz, resolution, offset, hashe
 
 @triton.jit
 @no_type_check
+def _level_of(resolutions, offsets, hashed_levels, count, width: tl.constexpr, block: tl.constexpr):
+    """Return the points and the features of a program, and its level; a lane has an entry's features in one piece."""
+    row = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)[:, None]
+    level = tl.program_id(1)
+    resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
+    hashed, feature = tl.load(hashed_levels + level), tl.arange(0, width)[None, :]
+    return row, row < count, feature, level, resolution, offset, hashed
+
+
+@triton.jit
+@no_type_check
 def _forward(
     table,
     points,
@@ -135,19 +162,19 @@ def _forward(
     count,
     levels: tl.constexpr,
     features: tl.constexpr,
+    width: tl.constexpr,
     block: tl.constexpr,
 ):
-    row, level = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64), tl.program_id(1)
-    valid = row < count
-    resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
-    hashed = tl.load(hashed_levels + level)
+    row, valid, feature, level, resolution, offset, hashed = _level_of(
+        resolutions, offsets, hashed_levels, count, width, block
+    )
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
-    for f in tl.static_range(features):
-        total = tl.zeros([block], tl.float32)
-        for corner in tl.static_range(8):
-            entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
-            total += weight * tl.load(table + entry * features + f, mask=valid, other=0.0).to(tl.float32)
-        tl.store(out + row * (levels * features) + level * features + f, total, mask=valid)
+    there = valid & (feature < features)
+    total = tl.zeros([block, width], tl.float32)
+    for corner in tl.static_range(8):
+        entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
+        total += weight * tl.load(table + entry * features + feature, mask=there, other=0.0).to(tl.float32)
+    tl.store(out + row * (levels * features) + level * features + feature, total, mask=there)
 
 
 @triton.jit
@@ -163,17 +190,18 @@ def _backward(
     count,
     levels: tl.constexpr,
     features: tl.constexpr,
+    width: tl.constexpr,
     block: tl.constexpr,
 ):
-    row, level = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64), tl.program_id(1)
-    valid = row < count
-    resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
-    hashed = tl.load(hashed_levels + level)
+    row, valid, feature, level, resolution, offset, hashed = _level_of(
+        resolutions, offsets, hashed_levels, count, width, block
+    )
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
+    at = grad + row * (levels * features) + level * features + feature
+    flowing = tl.load(at, mask=valid & (feature < features), other=0.0)
+    # Most of what flows back is zero, from padding and from what lies behind surfaces.
+    flows = valid & (tl.max(tl.abs(flowing), axis=1, keep_dims=True) != 0.0) & (feature < features)
     for corner in tl.static_range(8):
         entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
-        for f in tl.static_range(features):
-            flowing = tl.load(grad + row * (levels * features) + level * features + f, mask=valid, other=0.0)
-            # Relaxed: nobody reads before the kernel ends, and stricter ones empty the cache. Most of what flows back
-            # is zero, from padding and from what lies behind surfaces.
-            tl.atomic_add(into + entry * features + f, weight * flowing, mask=flowing != 0.0, sem="relaxed")
+        # Relaxed: nobody reads before the kernel ends, and stricter ones empty the cache.
+        tl.atomic_add(into + entry * features + feature, weight * flowing, mask=flows, sem="relaxed")

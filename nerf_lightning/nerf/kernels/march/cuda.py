@@ -1,6 +1,6 @@
-"""The march for CUDA: a lane walks along a ray, and steps over cells and whole blocks that are empty.
+"""The march for CUDA: a lane walks along a part of a ray, and steps over cells and whole blocks that are empty.
 
-It is done twice: to count a ray's intervals, and, once it is known where each ray's begin, to write them.
+It notes which intervals are occupied; once it is known how many lie before each part, they are written in a row.
 `TRITON_INTERPRET=1` runs the kernels without a GPU. The results are the same in each run.
 """
 
@@ -16,8 +16,10 @@ from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyC
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
 LANES = 256
-RAYS = 32
+WALKS = 32
 """Of a program: a warp, whose lanes wait for each other."""
+PARTS = 8
+"""That a ray is walked in at once: a step of a walk waits for memory, and a batch's rays alone do not fill a GPU."""
 
 
 def march(
@@ -30,25 +32,29 @@ def march(
 ) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals and where each ray would go on; the arguments are those of `march.march`."""
     count, intervals, device = rays.near.shape[0], lattice.shape[0] - 2, lattice.device
-    longest = intervals if limit is None else min(limit, intervals)
+    # How far a ray goes that takes a limited number is known at its end alone.
+    parts, longest = (PARTS, intervals) if limit is None else (1, min(limit, intervals))
+    room = triton.cdiv(longest, parts)
+    walks = count * parts
+    ends_of_walks = torch.empty(walks + 1, dtype=torch.int64, device=device)
     bounds = torch.empty(count + 1, dtype=torch.int64, device=device)
-    following = torch.empty_like(bounds[1:])
+    following, noted = torch.empty_like(bounds[1:]), torch.empty(walks, room, dtype=torch.int32, device=device)
     given = (rays.origins, rays.directions, state.enter, state.leave, state.jitter, state.next, lattice, grid.aabb)
     arrays = *(each.contiguous() for each in given), grid.cells, grid.leaps
-    sizes = count, intervals, grid.cells.shape[0], longest
-    programs = (max(1, triton.cdiv(count, RAYS)),)
-    _march[programs](*arrays, bounds, following, bounds, bounds, bounds, *sizes, 0, False, BLOCK, RAYS, num_warps=1)
-    bounds = bounds.cumsum(0)
-    found = bounds[-1]
+    sizes = walks, intervals, grid.cells.shape[0], room, parts
+    programs = (max(1, triton.cdiv(walks, WALKS)),)
+    _march[programs](*arrays, ends_of_walks, following, noted, *sizes, BLOCK, WALKS, num_warps=1)
+    ends_of_walks = ends_of_walks.cumsum(0)
+    found = ends_of_walks[-1]
     if capacity is None:
         capacity = int(found)
     else:
-        bounds = bounds.clamp(max=capacity)  # the last rays lose what does not fit
+        ends_of_walks = ends_of_walks.clamp(max=capacity)  # the last rays lose what does not fit
     index = torch.empty(capacity, dtype=torch.int64, device=device)
     starts, ends = torch.empty(capacity, device=device), torch.empty(capacity, device=device)
-    if count:
-        out = bounds, index, index, starts, ends
-        _march[programs](*arrays, *out, *sizes, capacity, True, BLOCK, RAYS, num_warps=1)
+    out = bounds, index, starts, ends
+    arrays = lattice.contiguous(), state.jitter.contiguous(), ends_of_walks, noted
+    _write[(max(1, count),)](*arrays, *out, count, room, capacity, parts, WALKS, num_warps=1)
     return RaggedSamples(index, starts, ends, bounds, found, longest), following
 
 
@@ -133,26 +139,25 @@ def _ahead(unit, speed, around):
 @no_type_check
 def _march(
     origins, directions, enter, leave, jitters, first, lattice, aabb, cells, leaps,
-    bounds, following, index, starts, ends, count, intervals, resolution, most, capacity,
-    write: tl.constexpr, side: tl.constexpr, block: tl.constexpr,
+    ends_of_walks, following, noted, walks, intervals, resolution, room, parts: tl.constexpr,
+    side: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    lane = tl.arange(0, block)
-    ray = tl.program_id(0) * block + lane
-    valid = ray < count
+    walk = tl.program_id(0) * block + tl.arange(0, block)
+    valid, ray = walk < walks, walk // parts
     ox, dx = _in_box(origins, directions, aabb, ray, valid, 0)
     oy, dy = _in_box(origins, directions, aabb, ray, valid, 1)
     oz, dz = _in_box(origins, directions, aabb, ray, valid, 2)
     near, far = tl.load(enter + ray, mask=valid, other=1.0), tl.load(leave + ray, mask=valid, other=0.0)
     jitter = tl.load(jitters + ray, mask=valid, other=0.0)
     k = tl.load(first + ray, mask=valid, other=0).to(tl.int32)
+    last = tl.full([block], intervals, tl.int32)
+    if parts > 1:
+        begin = walk % parts * room
+        k, last = tl.maximum(k, begin), tl.minimum(last, begin + room)
     longest = tl.load(lattice + intervals + 1) - tl.load(lattice + intervals)
     scale, blocks = 0.5 * resolution, resolution // side
-    found = tl.zeros([block], tl.int32)
-    begin, room = tl.zeros([block], tl.int64), tl.full([block], most, tl.int32)
-    if write:
-        begin = tl.load(bounds + ray, mask=valid, other=0)
-        room = (tl.load(bounds + ray + 1, mask=valid, other=0) - begin).to(tl.int32)
-    alive = valid & (near < far) & (k < intervals) & (room > 0)
+    found, into = tl.zeros([block], tl.int32), noted + walk.to(tl.int64) * room
+    alive = valid & (near < far) & (k < last)
     # Rays outside of the box pass to the lattice's end at once.
     k = tl.where(valid & ~(near < far), intervals, k)
     while tl.max(alive.to(tl.int32), axis=0) > 0:
@@ -167,12 +172,7 @@ def _march(
         b = tl.minimum(tl.maximum(y.to(tl.int32), 0), resolution - 1)
         c = tl.minimum(tl.maximum(z.to(tl.int32), 0), resolution - 1)
         occupied = asks & (tl.load(cells + (a * resolution + b) * resolution + c, mask=asks, other=0) != 0)
-        if write:
-            low, high = tl.load(lattice + at), tl.load(lattice + at + 1)
-            into = begin + found
-            tl.store(index + into, ray.to(tl.int64), mask=occupied)
-            tl.store(starts + into, low + jitter * (high - low), mask=occupied)
-            tl.store(ends + into, high + jitter * (tl.load(lattice + at + 2) - high), mask=occupied)
+        tl.store(into + found, at, mask=occupied)
         found += occupied.to(tl.int32)
         # To the end of what is empty around, a hair short: no interval too far.
         leap = tl.load(leaps + ((a // side) * blocks + b // side) * blocks + c // side, mask=asks, other=0)
@@ -188,18 +188,42 @@ def _march(
         skipped = tl.maximum(tl.minimum(ahead / longest, 1048576.0).to(tl.int32), 1)
         k = tl.where(alive & ~ended, k + tl.where(occupied, 1, skipped), k)
         k = tl.where(ended, intervals, tl.minimum(k, intervals))
-        alive = alive & ~ended & (k < intervals) & (found < room)
-    if write:
-        # Padding of no length, spread over the rays.
-        used = tl.load(bounds + count)
-        for start in range(used + tl.program_id(0) * block, capacity, tl.num_programs(0) * block):
+        alive = alive & ~ended & (k < last) & (found < room)
+    tl.store(ends_of_walks + 1 + walk, found.to(tl.int64), mask=valid)
+    if tl.program_id(0) == 0:
+        tl.store(ends_of_walks, 0)
+    # Of several walks the last one says where the ray would go on; they leave nothing behind.
+    tl.store(following + ray, tl.minimum(k, intervals).to(tl.int64), mask=valid & (walk % parts == parts - 1))
+
+
+@triton.jit
+@no_type_check
+def _write(
+    lattice, jitters, ends_of_walks, noted, bounds, index, starts, ends, count, room, capacity,
+    parts: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    ray, lane, part = tl.program_id(0).to(tl.int64), tl.arange(0, block), tl.arange(0, parts)
+    used = tl.load(ends_of_walks + count * parts)
+    tl.store(bounds + count, used, mask=ray == 0)
+    if ray < count:
+        jitter, walk = tl.load(jitters + ray), ray * parts
+        first, last = tl.load(ends_of_walks + walk), tl.load(ends_of_walks + walk + parts)
+        tl.store(bounds + ray, first)
+        begins, stops = tl.load(ends_of_walks + walk + part), tl.load(ends_of_walks + walk + part + 1)
+        for start in range(first, last, block):
             slot = start + lane
-            rest = slot < capacity
-            tl.store(index + slot, (slot % count).to(tl.int64), mask=rest)
-            tl.store(starts + slot, tl.zeros([block], tl.float32), mask=rest)
-            tl.store(ends + slot, tl.zeros([block], tl.float32), mask=rest)
-    else:
-        tl.store(bounds + 1 + ray, found.to(tl.int64), mask=valid)
-        if tl.program_id(0) == 0:
-            tl.store(bounds, 0)
-        tl.store(following + ray, k.to(tl.int64), mask=valid)
+            inside = slot < last
+            own = (slot[:, None] >= begins[None, :]) & (slot[:, None] < stops[None, :])
+            # Where the interval's number stands: in the row of its walk.
+            at = tl.sum(tl.where(own, (walk + part[None, :]) * room + slot[:, None] - begins[None, :], 0), axis=1)
+            k = tl.load(noted + at, mask=inside, other=0)
+            low, middle, high = tl.load(lattice + k), tl.load(lattice + k + 1), tl.load(lattice + k + 2)
+            tl.store(index + slot, ray + 0 * slot, mask=inside)
+            tl.store(starts + slot, low + jitter * (middle - low), mask=inside)
+            tl.store(ends + slot, middle + jitter * (high - middle), mask=inside)
+        # Padding of no length, spread over the rays.
+        for start in range(used + ray * block, capacity, count * block):
+            slot = start + lane
+            tl.store(index + slot, slot % count, mask=slot < capacity)
+            tl.store(starts + slot, tl.zeros([block], tl.float32), mask=slot < capacity)
+            tl.store(ends + slot, tl.zeros([block], tl.float32), mask=slot < capacity)

@@ -72,7 +72,7 @@ def trial(device: str = "cuda") -> None:
     with torch.enable_grad():
         foreground, opacity, _, _ = render(rays, samples, field, "float32", False, 1.0)
         (foreground.sum() + opacity.sum()).backward()
-    if table.grad is None or not bool(table.grad.isfinite().all()) or float(opacity[0]) < 0.9:
+    if table.grad is None or not bool(table.grad.isfinite().all()) or float(opacity[0].detach()) < 0.9:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 
@@ -154,7 +154,8 @@ class _Activated(torch.autograd.Function):
         if where.count:
             arrays = hidden, points, rgb, of_density.contiguous(), of_rgb.contiguous(), *where.arrays[1:]
             numbers = field.bias, LARGEST_SLOPE_RAW, field.least_slope, ctx.whole_from, where.count
-            flags = where.each, hidden.shape[1], not field.contracted, colored, ctx.whole_from > 0, BLOCK
+            flags = where.each, hidden.shape[1], not field.contracted, colored, ctx.whole_from > 0
+            flags = *flags, triton.next_power_of_2(hidden.shape[1]), BLOCK
             _activate_back[where.programs](*arrays, of_hidden, of_raw, *numbers, *flags)
         return of_hidden, of_raw if colored else None, None, None, None, None
 
@@ -259,7 +260,7 @@ def _activate_back(
     hidden, points, rgb, of_density, of_rgb, starts, ends, of_hidden, of_raw,
     bias, largest, least_slope, whole_from, count,
     each: tl.constexpr, width: tl.constexpr, boxed: tl.constexpr, colored: tl.constexpr, softened: tl.constexpr,
-    block: tl.constexpr,
+    columns: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
     valid = sample < count
@@ -274,9 +275,10 @@ def _activate_back(
     grad = tl.load(of_density + sample, mask=valid, other=0.0) * share * slope
     if boxed:
         grad = tl.where(_inside(points, sample, valid), grad, 0.0)
-    tl.store(of_hidden + sample * width, grad, mask=valid)
-    for column in tl.static_range(1, width):
-        tl.store(of_hidden + sample * width + column, tl.zeros([block], tl.float32), mask=valid)
+    # The density is the first of the hidden features; a program writes rows that lie one after the other.
+    column = tl.arange(0, columns)[None, :]
+    at = of_hidden + sample[:, None] * width + column
+    tl.store(at, tl.where(column == 0, grad[:, None], 0.0), mask=valid[:, None] & (column < width))
     if colored:
         for channel in tl.static_range(3):
             color = tl.load(rgb + 3 * sample + channel, mask=valid, other=0.0)
