@@ -101,6 +101,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
     (FIRST_START, "init_from"),
     (MACHINE, "trainer.**"),
+    (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched otherwise
     (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
     (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),

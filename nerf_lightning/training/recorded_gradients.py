@@ -8,8 +8,10 @@ of a batch) would stay as it was. So all that changes from step to step comes in
 a model decides on the host between two steps has recordings of its own (`Model.step_variant`).
 """
 
+import functools
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -37,9 +39,15 @@ def cuda_graph(work: Callable[[], StepOutput]) -> tuple[Callable[[], None], Step
             work()
     torch.cuda.current_stream().wait_stream(side)
     # The thread that makes batches pins memory, which a capture would otherwise forbid in every thread.
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+    with torch.cuda.graph(graph, pool=_pool(), capture_error_mode="thread_local"):
         seen = work()
     return graph.replay, seen
+
+
+@functools.cache
+def _pool() -> Any:
+    # Of all recordings: one is replayed at a time, and what it returns is copied before the next.
+    return torch.cuda.graph_pool_handle()
 
 
 @dataclass(frozen=True)
@@ -106,7 +114,9 @@ class RecordedGradients:
                     parameter.grad.zero_()
             return self.compute(batch, weight, key)
 
-        replay, seen = self.record(work)
-        for count, former in zip(self.counts(), before, strict=True):
-            count.copy_(former)
+        try:
+            replay, seen = self.record(work)
+        finally:
+            for count, former in zip(self.counts(), before, strict=True):
+                count.copy_(former)
         return _Recording(batch, weight, key, replay, seen, [parameter.grad for parameter in self.parameters])

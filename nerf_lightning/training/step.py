@@ -152,23 +152,26 @@ class TrainStep:
         self.loss.forget()
         self._forget_recordings()
 
-    def record_gradients(self, record: Recorder = cuda_graph) -> None:
-        """Record the way forward and back of batches, whole, and replay it from now on.
-
-        Raises:
-            InputError: something here decides on the host what a step computes, and a recording would not follow.
-        """
+    def decided_on_host(self) -> str | None:
+        """Return what decides on the host what a step computes, which a recording would not follow; None: nothing."""
         learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
         decides = ["refinement" if name == "rays" else name for name in learnt]
         decides += ["a penalty"] if any(part.penalty() is not None for part in self._parts()) else []
         decides += ["loss"] if self.loss.buffers_to_average() else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
-        if not self.model.replays or decides:
-            cause = f"and here are: {', '.join(decides)}" if decides else "and this model has others"
+        return ", ".join(decides) or (None if self.model.replays else "model")
+
+    def record_gradients(self, record: Recorder = cuda_graph) -> None:
+        """Record the way forward and back of batches, whole, and replay it from now on.
+
+        Raises:
+            InputError: something here decides on the host what a step computes.
+        """
+        if (decides := self.decided_on_host()) is not None:
             raise InputError(
-                "trainer.cuda_graph=true replays the same kernels in each step: it is for models without refinement, "
-                f"correction, model.subpixels, encoder.blend_in, and losses that learn, {cause}. Leave it out."
+                "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
+                f"step: {decides}. Leave it out."
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
@@ -177,6 +180,11 @@ class TrainStep:
         self._recorded = RecordedGradients(
             compute, self._parameters(), self.model.sample_counts, lambda: self.model.step_variant, record
         )
+
+    @property
+    def records(self) -> bool:
+        """Whether steps are recorded and replayed."""
+        return self._recorded is not None
 
     @property
     def rays_together(self) -> int:
@@ -266,7 +274,7 @@ class TrainStep:
         if self._recorded is None:
             seen = self.gradients(batch, backward, share)
         else:
-            seen = self._recorded(batch, share.weight, torch.full((), self._key, device=batch.weight.device))
+            seen = self._replayed(self._recorded, batch, backward, share)
         ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
         ranks.add_up_gradients(self._parameters())
         norms: dict[str, Tensor] = {}
@@ -284,6 +292,18 @@ class TrainStep:
                     progress.largest_batch, self.sample_budget / points, self.rays_together
                 )
         return replace(seen, gradient_norms=norms)
+
+    def _replayed(self, recorded: RecordedGradients, batch: Batch, backward: Backward, share: Share) -> StepOutput:
+        try:
+            return recorded(batch, share.weight, torch.full((), self._key, device=batch.weight.device))
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+        log.warning("There is no memory to record a step: all kernels of each step are launched one by one.")
+        self._recorded = None
+        for part in self.parts.values():
+            part.zero_grad(set_to_none=False)
+        return self.gradients(batch, backward, share)
 
     def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> StepOutput:
         """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.

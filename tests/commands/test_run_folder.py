@@ -82,14 +82,14 @@ def without(config, *names):
 
 def test_a_run_that_is_older_than_a_setting_goes_on_with_its_default(tmp_path, caplog):
     here = f"paths.output_dir={tmp_path}/here"
-    begin(without(config(tmp_path, here), "model.subpixels", "trainer.cuda_graph")).release()
+    begin(without(config(tmp_path, here), "model.subpixels", "trainer.clip_norm")).release()
     resumed = config(tmp_path, f"resume={tmp_path}/here")
     with pytest.raises(InputError, match=r"another config \(model.subpixels: there unknown, here 1,"):
         open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here", "model.subpixels=1"])
     with pytest.raises(InputError, match=r"another config \(seed: there 0, here 3,"):
         open_run(config(tmp_path, f"resume={tmp_path}/here", "seed=3"), 100, None)
     open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here"]).release()
-    assert "goes on with model.subpixels=1, trainer.cuda_graph=False." in caplog.text
+    assert "goes on with model.subpixels=1, trainer.clip_norm=None." in caplog.text
     assert begin(config(tmp_path, here, "resume=auto")).path == tmp_path / "here"
 
 

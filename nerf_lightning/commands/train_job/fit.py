@@ -90,7 +90,10 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         step.tile_points = settings.tile_points
     settings.prepare(step.model)
     job.system.record["precision"] = settings.precision
-    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN
+    automatic = settings.cuda_graph == "auto" and settings.device_type == "cuda" and ranks.world_size() == 1
+    records = settings.cuda_graph is True or (automatic and step.decided_on_host() is None)
+    # A recording takes whole batches.
+    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not records
     if former is None and measures_tile:
         tile = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
         step.tile_points = settings.tile_points = tile
@@ -98,13 +101,13 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         announce_memory(settings, step, job.data)
     if settings.compile:
         log.info("compiled levels: %s", ", ".join(step.model.compile_fields()) or "none has static shapes")
-    if settings.cuda_graph:
+    if records:
         step.record_gradients()
 
 
 def _announce(job: TrainJob, folder: HeldFolder) -> None:
     parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
-    tile = job.system.step.tile_points
+    step, tile = job.system.step, job.system.step.tile_points
     seconds = job.config.budget.seconds
     log.info(
         "run folder %s: %s of %d rays, %s parameters, %s, %s",
@@ -113,7 +116,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         job.data.batches.batch_rays,
         f"{parameters:,}",
         job.settings.describe(),
-        "whole batches" if tile is None else f"tiles of {tile} points",
+        "steps replayed" if step.records else "whole batches" if tile is None else f"tiles of {tile} points",
     )
     if folder.former is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new one")

@@ -39,7 +39,7 @@ class TrainerSettings(ComputeSettings):
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
-            for refinement, correction and losses that learn. Not yet run on a GPU.
+            for refinement, correction and losses that learn. auto: where the run permits it, in one process.
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
@@ -60,7 +60,7 @@ class TrainerSettings(ComputeSettings):
         val_every_steps: int = 500,
         num_threads: int | None = None,
         compile: bool = False,
-        cuda_graph: bool = False,
+        cuda_graph: bool | Literal["auto"] = "auto",
         deterministic: bool = False,
         devices: int | Literal["auto"] = 1,
         launched_by: Launcher = "nerf",
@@ -78,7 +78,7 @@ class TrainerSettings(ComputeSettings):
         self.lightning = passed_through(lightning)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
-        if cuda_graph and self.device_type != "cuda":
+        if cuda_graph is True and self.device_type != "cuda":
             raise InputError(
                 f"trainer.cuda_graph=true is for NVIDIA GPUs, and this run computes on {self.device_type} "
                 f"({self.device_reason}). Leave it out."

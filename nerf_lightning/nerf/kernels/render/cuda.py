@@ -154,9 +154,9 @@ class _Activated(torch.autograd.Function):
         if where.count:
             arrays = hidden, points, rgb, of_density.contiguous(), of_rgb.contiguous(), *where.arrays[1:]
             numbers = field.bias, LARGEST_SLOPE_RAW, field.least_slope, ctx.whole_from, where.count
-            flags = where.each, hidden.shape[1], not field.contracted, colored, ctx.whole_from > 0
-            flags = *flags, triton.next_power_of_2(hidden.shape[1]), BLOCK
-            _activate_back[where.programs](*arrays, of_hidden, of_raw, *numbers, *flags)
+            flags, width = (not field.contracted, colored, ctx.whole_from > 0), hidden.shape[1]
+            sizes = triton.next_power_of_2(width), BLOCK
+            _activate_back[where.programs](*arrays, of_hidden, of_raw, *numbers, where.each, width, *flags, *sizes)
         return of_hidden, of_raw if colored else None, None, None, None, None
 
 
