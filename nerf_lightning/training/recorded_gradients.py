@@ -8,13 +8,11 @@ of a batch) would stay as it was. So all that changes from step to step comes in
 a model decides on the host between two steps has recordings of its own (`Model.step_variant`).
 """
 
-import functools
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -39,15 +37,9 @@ def cuda_graph(work: Callable[[], StepOutput]) -> tuple[Callable[[], None], Step
             work()
     torch.cuda.current_stream().wait_stream(side)
     # The thread that makes batches pins memory, which a capture would otherwise forbid in every thread.
-    with torch.cuda.graph(graph, pool=_pool(), capture_error_mode="thread_local"):
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         seen = work()
     return graph.replay, seen
-
-
-@functools.cache
-def _pool() -> Any:
-    # Of all recordings: one is replayed at a time, and what it returns is copied before the next.
-    return torch.cuda.graph_pool_handle()
 
 
 @dataclass(frozen=True)
@@ -85,7 +77,7 @@ class RecordedGradients:
         self.variant, self.record = variant, record
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
-    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: Int[Tensor, ""]) -> StepOutput:
+    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: int) -> StepOutput:
         """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones."""
         kind = batch.num_rays, self.variant()
         if kind not in self.recordings:
@@ -94,15 +86,16 @@ class RecordedGradients:
         for inside, given in zip(kept.batch.tensors(), batch.tensors(), strict=True):
             inside.copy_(given)
         kept.weight.copy_(weight)
-        kept.key.copy_(key)
+        kept.key.fill_(key)
         kept.replay()
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
         # The next replay writes over what it has returned.
         return kept.seen.map(Tensor.clone)
 
-    def _recorded(self, batch: Batch, weight: Tensor, key: Tensor) -> _Recording:
-        batch, weight, key = batch.map(Tensor.clone), weight.clone(), key.clone()
+    def _recorded(self, batch: Batch, weight: Tensor, key: int) -> _Recording:
+        batch, weight = batch.map(Tensor.clone), weight.clone()
+        kept_key = torch.full((), key, device=weight.device)
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -110,13 +103,17 @@ class RecordedGradients:
 
         def work() -> StepOutput:
             for parameter in self.parameters:
-                if parameter.grad is not None:
+                # Others begin with zeros: the optimizer leaves them so (`optimizers.table_adam`).
+                if parameter.grad is not None and not getattr(parameter, "grad_in_place", False):
                     parameter.grad.zero_()
-            return self.compute(batch, weight, key)
+            return self.compute(batch, weight, kept_key)
 
         try:
             replay, seen = self.record(work)
         finally:
             for count, former in zip(self.counts(), before, strict=True):
                 count.copy_(former)
-        return _Recording(batch, weight, key, replay, seen, [parameter.grad for parameter in self.parameters])
+            for parameter in self.parameters:
+                if parameter.grad is not None:
+                    parameter.grad.zero_()
+        return _Recording(batch, weight, kept_key, replay, seen, [parameter.grad for parameter in self.parameters])

@@ -175,11 +175,15 @@ class TrainStep:
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
-            return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
+            seen = self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
+            if self._guards_in_recording:
+                self.guard.keep_finite(seen.losses, self._named_parameters())
+            return seen
 
-        self._recorded = RecordedGradients(
-            compute, self._parameters(), self.model.sample_counts, lambda: self.model.step_variant, record
-        )
+        def counts() -> list[Tensor]:
+            return [*self.model.sample_counts(), *self.guard.tensors(self.device)]
+
+        self._recorded = RecordedGradients(compute, self._parameters(), counts, lambda: self.model.step_variant, record)
 
     @property
     def records(self) -> bool:
@@ -276,9 +280,9 @@ class TrainStep:
         else:
             seen = self._replayed(self._recorded, batch, backward, share)
         ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
-        ranks.add_up_gradients(self._parameters())
+        ranks.add_up_gradients(parameter for _, parameter in self._named_parameters())
         norms: dict[str, Tensor] = {}
-        if self.guard.allows(seen.losses, self._named_parameters()):
+        if self._guards_in_recording or self.guard.allows(seen.losses, self._named_parameters()):
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
             self.loss.learn(seen.rgb, seen.target, seen.weight)
@@ -295,7 +299,7 @@ class TrainStep:
 
     def _replayed(self, recorded: RecordedGradients, batch: Batch, backward: Backward, share: Share) -> StepOutput:
         try:
-            return recorded(batch, share.weight, torch.full((), self._key, device=batch.weight.device))
+            return recorded(batch, share.weight, self._key)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
@@ -372,6 +376,11 @@ class TrainStep:
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
         return first_not_finite(self._named_parameters())
+
+    @property
+    def _guards_in_recording(self) -> bool:
+        # Several processes add up their gradients first.
+        return self._recorded is not None and ranks.world_size() == 1
 
     @property
     def _key(self) -> int:

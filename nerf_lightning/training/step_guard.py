@@ -23,27 +23,40 @@ class StepGuard:
 
     def allows(self, losses: Tensor, parameters: Iterable[tuple[str, Tensor]]) -> bool:
         """Tell whether the step may be taken."""
+        gradients = _gradients(parameters)
+        finite = self._count(losses, gradients)
+        if finite.device.type == "cpu":
+            return bool(finite)
+        _keep_finite(gradients, finite)
+        return True
+
+    def keep_finite(self, losses: Tensor, parameters: Iterable[tuple[str, Tensor]]) -> None:
+        """Count the step, and set its gradients to zero if it may not be taken; nothing is read on the host."""
+        gradients = _gradients(parameters)
+        _keep_finite(gradients, self._count(losses, gradients))
+
+    def tensors(self, device: torch.device) -> list[Tensor]:
+        """Return what is counted, where it stays."""
+        if self.counts is None or self.counts.device != device:
+            self.counts = torch.zeros(2, dtype=torch.long, device=device)
+        if self.first_bad is None or self.first_bad.device != device:
+            self.first_bad = torch.zeros((), dtype=torch.long, device=device)
+        return [self.counts, self.first_bad]
+
+    def _count(self, losses: Tensor, gradients: dict[str, Tensor]) -> Tensor:
+        """Return 1 where all is finite, else 0."""
         # Large tables are left out: what reaches them has passed through the MLPs, whose gradients show it too.
-        gradients = {name: parameter.grad for name, parameter in parameters if parameter.grad is not None}
         watched = {name: gradient for name, gradient in gradients.items() if gradient.numel() < LARGE}
         # Few operations, each of which is a launch on a GPU.
         sums = torch._foreach_norm([*watched.values(), losses], ord=1)
         finite, first_bad = (torch.stack(sums) < math.inf).int().min(dim=0)
-        if self.counts is None or self.counts.device != finite.device:
-            self.counts = torch.zeros(2, dtype=torch.long, device=finite.device)
+        counts, former = self.tensors(finite.device)
         bad = 1 - finite
-        self.counts = torch.stack([self.counts[0], self.counts[1] * bad]) + bad
-        begins = self.counts[1] == 1
-        self.first_bad = first_bad if self.first_bad is None else torch.where(begins, first_bad, self.first_bad)
+        counts[1:].mul_(bad)
+        counts.add_(bad)
+        former.copy_(torch.where(counts[1] == 1, first_bad, former))
         self.watched = [*watched, "loss.itself"]
-        if finite.device.type == "cpu":
-            return bool(finite)
-        if finite.is_cuda:  # all at once: the bits times 1 or 0, since NaN times 0 is NaN
-            torch._foreach_mul_([gradient.view(torch.int32) for gradient in gradients.values()], finite)
-        else:
-            for gradient in gradients.values():
-                gradient.masked_fill_(bad.bool(), 0.0)
-        return True
+        return finite
 
     @property
     def skipped(self) -> int:
@@ -66,7 +79,19 @@ class StepGuard:
 
     def restore(self, state: list[int], device: torch.device) -> None:
         """Take the counts up again."""
-        self.counts = torch.tensor(state, device=device)
+        self.tensors(device)[0].copy_(torch.tensor(state))
+
+
+def _gradients(parameters: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: parameter.grad for name, parameter in parameters if parameter.grad is not None}
+
+
+def _keep_finite(gradients: dict[str, Tensor], finite: Tensor) -> None:
+    if finite.device.type in ("cpu", "cuda"):  # all at once: the bits times 1 or 0, since NaN times 0 is NaN
+        torch._foreach_mul_([gradient.view(torch.int32) for gradient in gradients.values()], finite)
+        return
+    for gradient in gradients.values():
+        gradient.masked_fill_(finite == 0, 0.0)
 
 
 def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:

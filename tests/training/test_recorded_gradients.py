@@ -1,6 +1,7 @@
 """A recorded step is the step: `tests/support/tape.py` stands for CUDA graphs, with the torch twins of the kernels."""
 
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from unittest.mock import Mock
 
 import pytest
@@ -118,12 +119,10 @@ def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
         asked.update(how)
         yield
 
-    instead = {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock, "graph_pool_handle": Mock}
-    for name, stand_in in instead.items():
+    for name, stand_in in {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock}.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(torch.cuda, "current_stream", Mock())
     cuda_graph(lambda: Mock(spec=StepOutput))
-    assert asked.pop("pool") is not None
     assert asked == {"capture_error_mode": "thread_local"}
 
 
@@ -139,3 +138,18 @@ def test_without_memory_for_a_recording_the_step_is_taken_without(caplog):
     assert [each.count("no memory to record") for each in caplog.messages] == [1]
     assert not run.training.records
     assert_same(run, trained([48] * 3, record=False))
+
+
+def test_a_recorded_step_that_is_not_finite_changes_nothing_and_is_counted(monkeypatch):
+    run = trained([48] * 3, record=True)
+    before = {name: value.clone() for name, value in run.training.model.named_parameters()}
+    batch = run.loader.at(0, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(run.loader, "at", lambda *place: replace(batch, rgba=torch.full_like(batch.rgba, torch.nan)))
+        run.step()
+    assert run.training.guard.state() == [1, 1]
+    for name, value in run.training.model.named_parameters():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0, msg=name)
+    run.step()
+    assert run.training.guard.state() == [1, 0]
+    assert not torch.equal(run.training.model.state_dict()[name], before[name])

@@ -30,8 +30,8 @@ class OccupancyGrid(nn.Module):
     """1 where occupied."""
     blocks: Tensor
     """1 where any cell of a block is."""
-    leaps: Tensor | None
-    """How far the next such block is; None until it is asked for."""
+    leaps: Tensor
+    """How far the next such block is. A recorded step reads it where it lay: it is written to, never replaced."""
 
     def __init__(self, resolution: int) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("possible", torch.ones(side, dtype=torch.bool))
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
-        self.register_buffer("leaps", None, persistent=False)
+        self.register_buffer("leaps", torch.zeros(blocks, dtype=torch.uint8), persistent=False)
 
     def validate_state(self) -> None:
         """Look at what was loaded.
@@ -60,10 +60,7 @@ class OccupancyGrid(nn.Module):
 
     def occupied(self) -> OccupancyCells:
         """Return what a march looks at: which cells are occupied now."""
-        leaps = self.leaps  # threads may ask at once: each takes what it sees
-        if leaps is None:
-            leaps = self.leaps = leaps_over(self.blocks)
-        return OccupancyCells(self.aabb, self.cells, leaps)
+        return OccupancyCells(self.aabb, self.cells, self.leaps)
 
     def reset(self) -> None:
         """Forget what was learned: every possible cell is occupied."""
@@ -88,11 +85,11 @@ class OccupancyGrid(nn.Module):
         """Say which cells rays may not pass over."""
         self.cells.copy_(occupied)
         self.blocks.copy_(blocks_of(self.cells))
-        self.leaps = None
+        self.leaps.copy_(leaps_over(self.blocks))
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
-        self.leaps = None
+        self.leaps.copy_(leaps_over(self.blocks))
 
     def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
         """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""
