@@ -54,7 +54,7 @@ class StepGuard:
         bad = 1 - finite
         counts[1:].mul_(bad)
         counts.add_(bad)
-        former.copy_(torch.where(counts[1] == 1, first_bad, former))
+        torch.where(counts[1] == 1, first_bad, former, out=former)
         self.watched = [*watched, "loss.itself"]
         return finite
 

@@ -14,12 +14,12 @@ pytest.importorskip("triton", reason="triton is not installed (Linux only)")
 
 BUDGETS = {
     # On the device (operations and kernels): a step, a rendered tile. On the host: a step.
-    "fast_small,bf16-mixed": (87, 38, 7),
-    "fast_proposal,bf16-mixed": (132, 33, 7),
-    "nerf_tiny,bf16-mixed": (319, 120, 9),
-    "fast,bf16-mixed": (87, 38, 7),
-    "fast,32-true": (97, 42, 7),
-    "fast_proposal,32-true": (152, 41, 7),
+    "fast_small,bf16-mixed": (87, 38, 2),
+    "fast_proposal,bf16-mixed": (132, 33, 2),
+    "nerf_tiny,bf16-mixed": (319, 120, 4),
+    "fast,bf16-mixed": (87, 38, 2),
+    "fast,32-true": (97, 42, 2),
+    "fast_proposal,32-true": (152, 41, 2),
 }
 QUICK = list(BUDGETS)[:3]
 CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
