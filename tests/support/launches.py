@@ -4,10 +4,12 @@ Counted on `support.stand_in_device` by another of torch's modes. Kernels run th
 TRITON_INTERPRET=1 chooses it before they are imported: `measured` is for a process of its own.
 """
 
+import gc
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Self
 
 import torch
@@ -15,6 +17,7 @@ import triton
 from support.gpu_training import small, step_by_step
 from support.stand_in_device import StandInDevice, lies_there
 from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
@@ -43,6 +46,9 @@ class Launches(TorchDispatchMode):
         super().__init__()
         self.counts: Counter[str] = Counter()
         self.launch, self.computes = launch or KERNEL.run, launch is None
+        self.read: dict[str, StorageWeakRef] | None = None
+        """Arrays that were read and not made since `noting` began, by address and shape."""
+        self.made: list[Tensor] = []
 
     def __enter__(self) -> Self:
         self._run, self._try = KERNEL.run, backends._try
@@ -57,12 +63,33 @@ class Launches(TorchDispatchMode):
 
     def _launched(self, kernel: Any, *args: Any, **options: Any) -> None:
         self.counts.update(kernels=1, bytes=_bytes([*args, *options.values()]))
+        self._note([*args, *options.values()])
         with _disable_current_modes(), torch._C.DisableTorchFunction():
             self.launch(kernel, *args, **options)
+
+    @contextmanager
+    def noting(self) -> Iterator[dict[str, StorageWeakRef]]:
+        """Note which arrays are read that were there before."""
+        self.read, self.made = {}, []
+        try:
+            yield self.read
+        finally:
+            self.read, self.made = None, []
+
+    def _note(self, taken: list[Any], made: Sequence[Any] = ()) -> None:
+        if self.read is None:
+            return
+        inside = {each.untyped_storage().data_ptr() for each in self.made}
+        for each in taken:
+            if isinstance(each, Tensor) and lies_there(each) and each.untyped_storage().data_ptr() not in inside:
+                name = f"{each.untyped_storage().data_ptr()} {tuple(each.shape)}"
+                self.read[name] = StorageWeakRef(each.untyped_storage())
+        self.made += [each for each in made if isinstance(each, Tensor)]  # kept, so that no address comes twice
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         with torch._C.DisableTorchFunction():  # the stand-in has seen what Python asked for
             made = func(*args, **(kwargs or {}))
+        self._note(tree_leaves((args, kwargs)), tree_leaves(made))
         if func.name() in ALLOCATES:
             if not self.computes and func.name() != "aten::detach":
                 made.zero_()
@@ -87,6 +114,26 @@ def _bytes(values: list[Any]) -> int:
     return sum(min(each.nbytes, each.untyped_storage().nbytes()) for each in tensors)  # expanded ones are smaller
 
 
+def forgotten(model: str, precision: str) -> list[str]:
+    """Return the arrays that a recording of a small model's step would read after they are gone."""
+    with StandInDevice("cuda") as there, Launches() as launches:
+        run = step_by_step(model, there.device, precision, None, *small(model, resolution=8, num_levels=4))
+        read: dict[str, StorageWeakRef] = {}
+
+        def record(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+            work()
+            with launches.noting() as noted:
+                seen = work()
+            read.update(noted)
+            return lambda: None, seen
+
+        run.training.record_gradients(record=record)
+        for _ in range(8):  # across updates of grids
+            run.step()
+        gc.collect()
+        return [name for name, array in read.items() if array.expired()]
+
+
 def measured(model: str, precision: str) -> dict[str, Any]:
     """Return what one warm step and one rendered tile of a small model ask for, and losses with and without kernels."""
     changes = small(model, resolution=8, num_levels=4)
@@ -105,7 +152,8 @@ def measured(model: str, precision: str) -> dict[str, Any]:
             run = step_by_step(model, there.device, precision, None, *changes)
             for _ in range(STEPS):
                 run.step()
-    return {"step": step, "tile": tile, "losses": losses, "without": run.all_losses().tolist()}
+    without = run.all_losses().tolist()
+    return {"step": step, "tile": tile, "losses": losses, "without": without, "forgotten": forgotten(model, precision)}
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ def measured(case):
 def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
     found, precision = measured(case), case.split(",")[1]
     assert found["step"]["kernels"] > 0
+    assert found["forgotten"] == []  # what a recording (CUDA graph) reads is written to, and never replaced
     assert found["losses"] == pytest.approx(found["without"], rel=TOLERANCE[precision])
     counted = *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "tile")), found["step"]["host"]
     print(f'    "{case}": {counted},')  # pytest -rP shows the table anew
