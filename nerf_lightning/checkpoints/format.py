@@ -94,6 +94,6 @@ def require_training_state(content: Mapping[str, Any]) -> None:
     """
     for place, kinds, found in (("", TRAINING, content), (KEY, OF_A_RUN, content[KEY])):
         for key in kinds.keys() - found.keys():
-            raise Mismatch(place or "the file", f"lacks {key}, so that no training goes on from it")
+            raise Mismatch(place or "the file", f"lacks {key}, so training cannot resume from it")
     if Version(content[LIGHTNING]) < Version("2.0"):
         raise Mismatch(LIGHTNING, "is of a version that this program has never used")

@@ -205,7 +205,7 @@ def newest_checkpoint(folder: Path, to_resume: bool = False) -> Checkpoint | Non
         except InputError:
             raise error from None
     reason = "is damaged" if last.exists() else "is missing"
-    log.warning("%s %s; the one before is used instead: %s, of step %d.", last, reason, previous, found.step)
+    log.warning("%s %s; the previous one is used instead: %s, of step %d.", last, reason, previous, found.step)
     return found
 
 

@@ -35,13 +35,13 @@ def require_same_capture(there: Mapping[str, Any], here: Mapping[str, Any], allo
     changed = changes(there, here)
     if not changed:
         return
-    found = f"the capture {here['scene']['name']} is not the one that this run has learned from: {'; '.join(changed)}"
+    found = f"the capture {here['scene']['name']} is not the one that this run was trained on: {'; '.join(changed)}"
     if not allow_changed:
         raise InputError(
-            f"Training cannot go on, for {found}. Restore the capture, or begin a new run (without resume); "
-            "resume_changed_capture=true goes on all the same."
+            f"Training cannot resume: {found}. Restore the capture, or start a new run (without resume); "
+            "resume_changed_capture=true resumes anyway."
         )
-    log.warning("%s. What was learned of a photograph goes on with the one that now has its number.", found)
+    log.warning("%s. What was learned about each photograph now applies to the one with the same number.", found)
 
 
 def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:

@@ -83,6 +83,6 @@ def _require_contract(target: Any, source: str, trusted: Sequence[str]) -> None:
     if not (isinstance(found, type) and issubclass(found, CONTRACTS) and found.__module__ == module_name):
         raise InputError(
             f"{source} asks for {target}, which is not a model part of this program, so it is not built. If it is your "
-            f"own, add trust={module_name}; else use a checkpoint from a source that you trust, or install the version "
-            "that has this class."
+            f"own, add trust={module_name}; otherwise use a checkpoint from a source that you trust, or install the "
+            "version that has this class."
         )

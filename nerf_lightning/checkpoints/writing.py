@@ -60,12 +60,12 @@ def _keep(last: Path, previous: Path) -> None:
 def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
     if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
         error = error.__context__  # torch closes what it could not write, and complains of that
-    kept = f"The former checkpoint {target} is unharmed. " if target.exists() else ""
+    kept = f"The previous checkpoint {target} is intact. " if target.exists() else ""
     full = isinstance(error, OSError) and error.errno in FULL
-    cure = "Free some space" if full else f"See that there is space and that {target.parent} can be written"
+    cure = "Free some space" if full else f"Make sure that there is free space and that {target.parent} is writable"
     return InputError(
-        f"The checkpoint {target} could not be saved: {error}. {kept}{cure}, "
-        f"then go on with resume={target.parent.parent}."
+        f"The checkpoint {target} could not be saved: {error}. {kept}{cure}, then continue with "
+        f"resume={target.parent.parent}."
     )
 
 

@@ -52,8 +52,8 @@ def require_settings(words: Sequence[str], or_paths: bool) -> None:
     for word, is_bare, before_bare in zip(words, bare, [*bare, False][1:], strict=True):
         if word.startswith("=") or (is_bare and not or_paths) or (word.endswith("=") and before_bare):
             raise InputError(
-                f"'{word}' is no setting: settings are key=value without spaces: scene.root=data/x. A value that has "
-                'spaces needs quotes for the shell: "scene.root=data/my x".'
+                f"'{word}' is not a setting. Settings are key=value without spaces, such as scene.root=data/x. "
+                'A value that has spaces needs quotes for the shell: "scene.root=data/my x".'
             )
 
 
@@ -70,6 +70,6 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
     from nerf_lightning.config.overrides import quoted  # brings Hydra
 
     if len(paths) > 1 and not several:
-        raise InputError(f"{key}: one folder is wanted, and {len(paths)} were given: {', '.join(paths)}.")
+        raise InputError(f"{key} takes one folder, but {len(paths)} were given: {', '.join(paths)}.")
     value = f"[{','.join(map(quoted, paths))}]" if several else quoted(paths[0])
     return [*(word for word in arguments if word not in paths), f"{key}={value}"]

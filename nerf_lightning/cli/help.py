@@ -4,6 +4,7 @@ Hydra has scripts for completion, too. They compose the config at each press of 
 neither our commands nor what a setting takes.
 """
 
+import re
 from pathlib import Path
 
 from nerf_lightning.config.manual.candidates import SHELLS, candidates
@@ -36,6 +37,9 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
     pages = [_in_every_command(word, commands) for word in words]
     order = sorted(commands, key=lambda name: name != "train")
     found = "" if all(pages) else search(words, list(map(_command, order)), _width())
+    if not found and len(words) > 1 and not all(pages) and not re.search(r"[.=]", "".join(words)):
+        told = f"Nothing in the help has all these words: {' '.join(words)}."
+        raise InputError(f"{told} Use fewer, such as nerf help {words[-1]}.")
     return found or "\n\n".join(page or _found(word, order) for word, page in zip(words, pages, strict=True))
 
 

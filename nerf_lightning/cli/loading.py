@@ -22,7 +22,7 @@ def announce_start(command: str, arguments: list[str]) -> None:
     """Say at a terminal at once that a command has started, unless an option of Hydra's asks for something brief."""
     brief = any(word.startswith("-") and word not in ("-m", "--multirun", "-v", "--verbose") for word in arguments)
     if "torch" not in sys.modules and not brief and sys.stderr is not None and sys.stderr.isatty():
-        print(f"nerf {command} starts; loading PyTorch takes a few seconds", file=sys.stderr, flush=True)
+        print(f"starting nerf {command}; loading PyTorch takes a few seconds", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -90,7 +90,7 @@ def _export(arguments: list[str]) -> list[str]:
     # Nothing is known here of an exporter of a person's own: it may need them.
     if exporter is not None and not getattr(exporter, "needs_photographs", False):
         return arguments
-    return _eval_or_without(arguments, ["photographs=false"], f"what={named[-1]} goes without photographs")
+    return _eval_or_without(arguments, ["photographs=false"], f"what={named[-1]} does not use photographs")
 
 
 def _eval_or_without(arguments: list[str], without: list[str], said: str) -> list[str]:

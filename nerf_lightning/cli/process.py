@@ -139,7 +139,6 @@ def require_no_settings_here() -> None:
     for name, library in SETTINGS.items():
         if os.path.lexists(name):
             raise InputError(
-                f"The working directory has a file {name}, which would be obeyed by {library}; with it, whoever made "
-                "this folder could change what is computed, or have programs run. Rename the file, or start nerf in "
-                "another folder."
+                f"The working directory has a file {name}, which would be read by {library}. Such a file can change "
+                "results or run programs. Rename it, or start nerf in another folder."
             )

@@ -34,7 +34,7 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     resuming = (_value(arguments, "sweep.resume") or "").lower() == "true"
     if not is_sweep(arguments):
         if resuming:
-            raise InputError("sweep.resume=true goes on with a sweep: add -m. A single run goes on with resume=auto.")
+            raise InputError("sweep.resume=true resumes a sweep: add -m. To resume a single run, use resume=auto.")
         return arguments
     if _value(arguments, "hydra/launcher") == "slurm" and shutil.which("srun") is None:
         raise InputError(
@@ -74,14 +74,14 @@ def _resumed(arguments: list[str], folder: str | None) -> list[str]:
     if folder is None:
         newest = next((str(folder) for folder, _ in _sweeps(arguments)), "DIR")
         raise InputError(
-            "sweep.resume=true needs the folder of the sweep that it goes on with. Add paths.output_dir=DIR; the "
-            f"newest is paths.output_dir={newest}."
+            "sweep.resume=true needs the folder of the sweep to resume. Add paths.output_dir=DIR; the newest is "
+            f"paths.output_dir={newest}."
         )
     former = former_sweep(Path(folder), arguments)
     if not former and not _swept(arguments):
         raise InputError(
-            f"sweep.resume=true: {folder} holds no sweep (no .hydra/sweep.yaml). Give the folder of one, or the whole "
-            "command with the values that are swept to begin one there."
+            f"sweep.resume=true: {folder} holds no sweep (no .hydra/sweep.yaml). Give the folder of one, or the full "
+            "command, with the values to sweep, to start one there."
         )
     return [*former, *arguments]
 

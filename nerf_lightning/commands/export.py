@@ -111,9 +111,9 @@ def page_path(
             log.info("the page plays %s", folder / name)
             return tuple(map(asdict, found))
         except InputError as error:
-            log.warning("The page does not play what was recorded last: %s", error)
+            log.warning("The page does not play the path that was recorded last: %s", error)
     try:
         return tuple(map(asdict, as_keyframes(path, around)))
     except InputError as error:
-        log.warning("The page is without a camera path: %s", error)
+        log.warning("The page has no camera path: %s", error)
         return ()

@@ -43,7 +43,7 @@ def run(config: DictConfig) -> int:
 
 def _source(config: DictConfig) -> Path:
     if (config.images is None) == (config.video is None):
-        raise InputError("Give either images=DIR (a folder of photographs) or video=FILE, one of the two.")
+        raise InputError("Give either images=DIR (a folder of photographs) or video=FILE.")
     key = "images" if config.video is None else "video"
     return Path(required_path(key, config[key]))
 
@@ -55,6 +55,6 @@ def _settings(config: DictConfig) -> SfmSettings:
     require_fitting_values({"_target_": f"{SfmSettings.__module__}.{SfmSettings.__name__}", **chosen})
     if config.every is not None:
         if not isinstance(config.every, int):
-            raise InputError(f"every={config.every} does not fit: it must be a whole number or null.")
+            raise InputError(f"every={config.every} is not valid: it must be a whole number or null.")
         require_positive(every=config.every)
     return SfmSettings(**chosen)

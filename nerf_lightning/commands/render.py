@@ -1,4 +1,4 @@
-"""Render a video along a camera path."""
+"""Render a film (video) along a camera path."""
 
 from dataclasses import replace
 from typing import Any, cast
@@ -51,8 +51,8 @@ def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
         return scene_record(scene_to_look_at(opened, scene))
     if scene is not None:
         raise InputError(
-            f"{opened.checkpoint.path} knows the scene {opened.checkpoint.scene.name} alone. Leave scene=... out; "
-            "models that look at photographs render other scenes, too."
+            f"{opened.checkpoint.path} can render only its own scene, {opened.checkpoint.scene.name}. Leave out "
+            "scene=...: only models that use photographs render other scenes."
         )
     return opened.checkpoint.scene
 

@@ -24,8 +24,7 @@ def run(config: DictConfig) -> str:
     run = Path(str(config.run))
     if not (run / "run.json").is_file():
         raise InputError(
-            f"run={run}: there is no run in it (no run.json). Give the folder of one, such as "
-            "outputs/bricks/2026-11-21_10-00-00."
+            f"run={run} is not a run folder: it has no run.json. Give one, such as outputs/bricks/2026-11-21_10-00-00."
         )
     require_nothing_from_outside(run)
     target = output_folder(config.paths.output_dir, run) / "report.html"

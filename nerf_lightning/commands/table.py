@@ -31,7 +31,7 @@ def run(config: DictConfig) -> int:
     title = f"{count} run{'' if count == 1 else 's'}, sorted by {config.sort}"
     out = config.out or config.paths.output_dir
     written = _write(rows, notes, title, Path(str(out))) if out else []
-    print_rows(rows, title, "A wider one shows more, and out=DIR writes all of it.")
+    print_rows(rows, title, "Widen it, or write all columns to files with out=DIR.")
     say(*notes, *(f"written to  {path}" for path in written))
     return len(rows)
 

@@ -42,7 +42,7 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
                 "trainer=mps: torch sees no Apple GPU here. It needs a Mac with Apple silicon and macOS 14 or later; "
                 "use trainer=cpu or trainer=auto."
             )
-        log.warning("trainer=mps has never been tried: compare its first losses with those of trainer=cpu.")
+        log.warning("trainer=mps has never been tested: compare its first losses with those of trainer=cpu.")
         return "mps", "as asked, untested"
     if accelerator == "tpu":
         return "xla", f"{xla_device.require_device()}, as asked"
@@ -59,7 +59,7 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
             "trainer=auto, or install a CUDA build of torch that suits the driver, which nvidia-smi shows."
         )
     if reason:
-        log.warning("The CPU computes, since torch cannot use the GPU here: %s", reason)
+        log.warning("Using the CPU, because torch cannot use the GPU here: %s", reason)
     return "cpu", "no GPU found"
 
 
@@ -74,8 +74,8 @@ def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> 
         return chosen
     if accelerator == "gpu" or distributed.is_initialized():
         raise InputError(
-            f"torch sees a GPU here, and it cannot be used: {trouble}. nvidia-smi shows who uses it and which driver "
-            "there is. Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
+            f"torch sees a GPU here but cannot use it: {trouble}. nvidia-smi shows what is using it, and the driver. "
+            "Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
         )
     log.warning(
         "PyTorch sees a GPU, but it cannot be used: %s. The CPU is used instead; trainer=gpu insists on the GPU.",
@@ -88,7 +88,7 @@ def _trouble_of_gpu() -> str | None:
     try:
         free, total = torch.cuda.mem_get_info()
         if free < LEAST_GPU_MEMORY:
-            return f"{free / 1e9:.1f} GB of its {total / 1e9:.1f} GB of memory are free, and 1 GB is the least"
+            return f"{free / 1e9:.1f} GB of its {total / 1e9:.1f} GB of memory are free, and at least 1 GB is needed"
         square = torch.ones(8, 8, device="cuda")
         right = bool((square @ square == 8.0).all())
     except RuntimeError as error:  # no memory, no kernels for this GPU, a driver that does not fit
@@ -108,16 +108,16 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
     if asked == "auto" and meant != "auto":
         if meant not in get_args(Precision):
             raise InputError(
-                f"NERF_LIGHTNING_PRECISION={meant} in the environment is no precision: give one of "
-                f"{', '.join(get_args(Precision))}, or unset it."
+                f"NERF_LIGHTNING_PRECISION={meant} in the environment is not a precision: use one "
+                f"of {', '.join(get_args(Precision))}, or unset it."
             )
         return choose_precision(cast(Precision, meant), device_type)[0], "as NERF_LIGHTNING_PRECISION says"
     if asked == "auto":
         return ("bf16-mixed", NATIVE) if has_native_bfloat16(device_type) else ("32-true", "no native bfloat16")
     if asked == "tf32" and not has_tf32(device_type):
         raise InputError(
-            "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
-            "device here is none. Use trainer.precision=32-true, or auto."
+            "trainer.precision=tf32: TensorFloat-32 needs an NVIDIA GPU of the Ampere generation (2020) or later, "
+            "which this device is not. Use trainer.precision=32-true, or auto."
         )
     if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
         instead = "float32 is used instead" if device_type == "cuda" else "it is emulated, slowly"
@@ -159,8 +159,8 @@ def use_threads(number: int) -> None:
         torch.set_num_threads(number)
     else:
         log.warning(
-            "The run has used %d threads and this machine has %d cores: it goes on with %d, and may differ in the last "
-            "bits.",
+            "The run used %d threads, but this machine has %d cores: it continues with %d, and results may differ in "
+            "the last bits.",
             number,
             cores,
             torch.get_num_threads(),

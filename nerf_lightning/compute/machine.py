@@ -83,9 +83,9 @@ def require_memory(what: str, size: int, needed: Callable[[int], float], named: 
     if bytes_needed <= free:
         return
     fitting = bisect_right(range(1, size), free, key=needed)
-    cure = f"{named(fitting)} would fit." if fitting else "Not even the smallest would fit: make room."
+    cure = f"{named(fitting)} would fit." if fitting else "Even the smallest would not fit: free some memory."
     raise InputError(
-        f"{what}, which takes {bytes_needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB of memory can be had. {cure}"
+        f"{what}, which takes {bytes_needed / 1e9:.1f} GB, but only {free / 1e9:.1f} GB of memory are available. {cure}"
     )
 
 

@@ -94,7 +94,7 @@ class ComputeSettings:
     def keep_precision(self, former: Any) -> None:
         """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
         if self.reason != "as asked":
-            self._chosen = self.precision, self.reason = former, "as the run began"
+            self._chosen = self.precision, self.reason = former, "as when the run started"
 
 
 def cluster_environment() -> ClusterEnvironment:

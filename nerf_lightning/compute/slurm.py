@@ -37,6 +37,8 @@ def requeue() -> None:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT_SECONDS)
     except (OSError, subprocess.SubprocessError) as error:
         reason = getattr(error, "stderr", None) or error
-        log.error("%s failed: %s. Submit the job again by hand; it will go on.", " ".join(command), str(reason).strip())
+        log.error(
+            "%s failed: %s. Submit the job again by hand; it will resume.", " ".join(command), str(reason).strip()
+        )
     else:
         log.info("Slurm job %s is queued again and will resume from here", job)

@@ -20,7 +20,7 @@ def require_device() -> str:
     if importlib.util.find_spec("torch_xla") is None:
         raise InputError(
             "trainer=tpu needs torch_xla, which is not installed here. It runs on a TPU's host (Linux, x86-64), and "
-            "its newest release, 2.9, goes with torch 2.9 alone: `make xla` installs both into an environment of their "
+            "its newest release, 2.9, needs torch 2.9: `make xla` installs both into an environment of their "
             "own, where .venv-xla/bin/nerf is the command. Elsewhere use trainer=auto."
         )
     if not ACCELERATOR.is_available():

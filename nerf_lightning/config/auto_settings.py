@@ -91,11 +91,12 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
         pixels = grid_for(scene)
         resolution = max(pixels // 2, 512) if short or few else pixels
         table = 18 if short else TABLE_SIZES[resolution]
-        cause = "so short a training" if short else "so few photographs without known distances"
+        cause = "the run is short" if short else "there are few photographs and no known distances"
         log.info(
-            "encoder: %d cells a side, %s, and tables of 2^%d (encoder.max_resolution=N, encoder.log2_table_size=N)",
+            "encoder: %d cells per side, %s, and hash tables of 2^%d entries (encoder.max_resolution=N, "
+            "encoder.log2_table_size=N)",
             resolution,
-            "as small as the pixels" if resolution == pixels else f"twice as wide as the pixels for {cause}",
+            "as small as the pixels" if resolution == pixels else f"twice as wide as the pixels because {cause}",
             table,
         )
         suited += [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
@@ -153,5 +154,5 @@ def resolve_correction(
 def _settle(section: DictConfig, key: str, value: bool) -> None:
     meant = {AUTO: value, "on": True, "off": False, True: True, False: False}
     if section[key] not in meant:
-        raise InputError(f"{key}={section[key]} does not fit: it must be on, off or auto.")
+        raise InputError(f"{key}={section[key]} is not valid: it must be on, off or auto.")
     section[key] = meant[section[key]]

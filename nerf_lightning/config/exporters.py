@@ -39,7 +39,7 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
 
 def _exporter(name: str, asked: Any) -> Any:
     if asked is not True and not isinstance(asked, DictConfig):
-        raise InputError(f"final.{name}={asked}: give true, or settings as of nerf export: final.{name}.KEY=VALUE.")
+        raise InputError(f"final.{name}={asked}: give true, or settings of nerf export: final.{name}.KEY=VALUE.")
     settings = {} if asked is True else flatten(asked)
     overrides = [f"what.{key}={quoted(value)}" for key, value in settings.items()]
     try:

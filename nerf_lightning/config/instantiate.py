@@ -33,7 +33,7 @@ def require_fitting_values(node: Any, path: str = "") -> None:
 def required_path(key: str, value: object) -> str:
     """Return a setting that names a file or folder."""
     if not isinstance(value, str) or not value:
-        raise InputError(f"{key}={value} does not fit: it must be a path.")
+        raise InputError(f"{key}={value} is not valid: it must be a path.")
     return value
 
 
@@ -44,7 +44,7 @@ def require_sections(config: DictConfig, command: str) -> None:
     for key, section in ((str(key), section) for key, section in sections.items()):
         if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
             raise InputError(
-                f"{key}={config[key]} does not fit: it holds settings, such as {key}.{next(iter(section))}=VALUE."
+                f"{key}={config[key]} is not valid: it holds settings, such as {key}.{next(iter(section))}=VALUE."
             )
 
 
@@ -64,10 +64,10 @@ def require_fitting(value: Any, annotation: Any, path: str) -> None:
         if any(_fits(value, option) for option in known):
             return
         shown = str(value)[:80]
-        raise InputError(f"{path}={shown} does not fit: it must be a {ours[0].__name__}, chosen by its group.")
+        raise InputError(f"{path}={shown} is not valid: it must be a {ours[0].__name__}, chosen by its group.")
     if len(known) < len(options) or any(_fits(value, option) for option in options):
         return
-    raise InputError(f"{path}={value} does not fit: it must be {' or '.join(map(_words, options))}.")
+    raise InputError(f"{path}={value} is not valid: it must be {' or '.join(map(_words, options))}.")
 
 
 def _fits(value: Any, option: Any) -> bool:

@@ -66,7 +66,7 @@ def hold_to_budgets(model: Model, where: str) -> None:
         if isinstance(part, Sampler):
             part.max_intervals = limits().intervals
     if not model.level_names:
-        raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
+        raise InputError(f"{where} has no level (model.levels is empty); at least one is needed.")
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 

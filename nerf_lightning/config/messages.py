@@ -53,7 +53,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
     while_choosing = any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
     if isinstance(error, (ValueError, TypeError)) and while_choosing:
         return (
-            f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
+            f"A group was given something other than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
     if isinstance(error, (MemoryError, RuntimeError)):
         return _of_machine(error)
@@ -63,7 +63,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
         if cause is not None:
             return str(cause)
         where = f"{os.fsdecode(error.filename)}: " if error.filename else ""
-        return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
+        return f"{where}{error.strerror or error}. Check that the folder exists, is writable, and has free space."
     return None
 
 
@@ -74,14 +74,14 @@ def _of_machine(error: MemoryError | RuntimeError) -> str | None:
     reason = " ".join(str(error).split())
     if isinstance(error, MemoryError) or is_out_of_memory(error):
         return (
-            f"There is no memory for this: {reason.partition('. ')[0] or 'Python got none'}. Use a smaller model or "
-            "smaller pictures, smaller tiles (trainer.tile_points), or another device (trainer=cpu); on a GPU, "
-            "nvidia-smi shows who else uses it."
+            f"Not enough memory: {reason.partition('. ')[0] or 'Python got none'}. Use a smaller model or smaller "
+            "pictures, smaller tiles (trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi "
+            "shows what else is using it."
         )
     if is_device_failure(error):
         return (
-            f"The GPU has failed: {reason[:200]}. What was written before is whole. Try again; if it fails again, nerf "
-            "selftest tells whether the GPU computes right, and trainer=cpu does without it."
+            f"The GPU has failed: {reason[:200]}. Files written before are complete. Try again; if it fails again, "
+            "nerf selftest checks the GPU's results, and trainer=cpu does not use it."
         )
     return None
 
@@ -110,8 +110,8 @@ def explain(error: BaseException, command: str) -> str:
         part = where.group(1) if where else "The config"
         if isinstance(chain[-1], ModuleNotFoundError):
             return (
-                f"{part} cannot be built: {reason}. Python looks among the installed packages and in the folders of "
-                f"the variable PYTHONPATH: for a file of your own put PYTHONPATH=FOLDER before nerf {command}."
+                f"{part} cannot be built: {reason}. Python searches the installed packages and the folders in "
+                f"PYTHONPATH. For a file of your own, put PYTHONPATH=FOLDER before nerf {command}."
             )
         return f"{part} cannot be built: {reason}. See nerf {command} --help."
     message = " ".join(str(error).split())
@@ -129,7 +129,7 @@ def explain(error: BaseException, command: str) -> str:
 def _not_given(error: MissingMandatoryValue, command: str) -> str:
     key = error.full_key or str(error)
     if key not in ("ckpt", "run"):
-        return f"nerf {command} needs {key}: add {key}=VALUE. nerf help {key} tells what it is."
+        return f"nerf {command} needs {key}: add {key}=VALUE. nerf help {key} explains it."
     root = OmegaConf.select(error.parent_node._get_root(), "paths.root_dir") if error.parent_node else "outputs"
     last = max(Path(root).glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
     if last is None:
@@ -156,7 +156,7 @@ def unknown_name(message: str, command: str) -> str | None:
         return _no_option(*option.groups())
     added = ADDED.search(message)
     if added is not None:
-        return f"nerf {command} has {added[1]} already: leave the + out. Type {added[1]}={added[2]}."
+        return f"nerf {command} has {added[1]} already: leave out the +. Type {added[1]}={added[2]}."
     return None if key is None else _no_setting(key["key"], key["value"], asked)
 
 
@@ -172,7 +172,7 @@ def _no_setting(name: str, value: str | None, asked: Command) -> str:
     having = listed(dict.fromkeys(each.source for each in asked.settings if each.key == name), cap=4)
     if having:
         instead = " scene=bricks is rendered, in the size scene.resolution=N." if name == "scene.downscale" else ""
-        return f"{name} is a setting of {having}, and something else is chosen.{instead} nerf help {name} tells of it."
+        return f"{name} is a setting of {having}, which is not chosen.{instead} nerf help {name} explains it."
     told = f"nerf {asked.name} has no setting {name}."
     section, _, argument = name.partition(".")
     if section == "trainer" and argument in OWNED:

@@ -63,7 +63,7 @@ def trusted_modules(trust: Any) -> list[str]:
     named = [] if trust is None else [trust] if isinstance(trust, str) else list(trust)
     for name in named:
         if not isinstance(name, str) or not all(word.isidentifier() for word in name.split(".")):
-            raise InputError(f"trust={name}: give the name of a Python module of yours, as it is imported: my_parts.")
+            raise InputError(f"trust={name}: give the name of a Python module of your own, such as my_parts.")
     return named
 
 
@@ -94,5 +94,5 @@ def read_photographs(config: DictConfig, opened: LoadedModel) -> Scene | None:
     try:
         return as_known(build(config.scene).read(), opened)
     except (InputError, OSError) as error:
-        log.warning("The photographs cannot be read, so this goes without them: %s", error)
+        log.warning("The photographs cannot be read and are left out: %s", error)
         return None

@@ -69,8 +69,8 @@ def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[st
     unknown = [key for key in recorded if key not in ours and not names_a_class(key)]
     if unknown:
         log.warning(
-            "%s was trained with %s. Such settings, which this program does not know, are not taken from a file. "
-            "Give them by hand if they are yours.",
+            "%s was trained with %s. This program does not know these settings and does not take them from a file. If "
+            "they are yours, type them.",
             for_terminal(path),
             listed(unknown, cap=5),
         )

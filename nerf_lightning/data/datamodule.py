@@ -86,7 +86,7 @@ class RayDataModule(LightningDataModule):
                 "crop (whose length is counted in batches of one size), or data.sample_budget=null."
             )
         if device_budget != "auto" and device_budget < 0:
-            raise InputError(f"data.device_budget={device_budget}: give gigabytes, 0 for none of them, or auto.")
+            raise InputError(f"data.device_budget={device_budget}: give gigabytes, 0 for none, or auto.")
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
         _check_background(scene)
@@ -146,7 +146,7 @@ class RayDataModule(LightningDataModule):
 def _few_views(scene: Scene, count: int) -> Scene:
     """Return the scene with a few training views, which are validated on as well; the test views stay."""
     if count < 1:
-        raise InputError(f"data.overfit_views={count}: give at least one photograph, or null for a training on all.")
+        raise InputError(f"data.overfit_views={count}: give at least one photograph, or null to train on all.")
     few = tuple(evenly_spaced_subset(scene.splits["train"], count))
     return replace(scene, splits=scene.splits | {"train": few, "val": few})
 
@@ -163,8 +163,8 @@ def _check_views_per_step(
         )
     if sample_budget is not None or patch > 1 or depth_every:
         raise InputError(
-            f"data.views_per_step={views} goes neither with data.sample_budget, whose steps have no fixed number of "
-            "rays, nor with losses that look at squares of pixels (loss.patch) or at known distances (loss=depth). "
+            f"data.views_per_step={views} cannot be combined with data.sample_budget, whose steps have no fixed number "
+            "of rays, or with losses that look at squares of pixels (loss.patch) or at known distances (loss=depth). "
             "Give data.sample_budget=null and another loss, or data.views_per_step=null."
         )
 
@@ -177,9 +177,9 @@ def _check_background(scene: Scene) -> None:
         )
     if scene.background in DRAWN and not scene.pixels.has_transparency:
         log.warning(
-            "scene.background=%s: the pictures of %s have no transparent pixels, so whatever lies behind the "
-            "scene is part of them and is learned as matter. Give the background's color instead "
-            "(scene.background=black or white).",
+            "scene.background=%s: the pictures of %s have no transparent pixels, so whatever lies behind the scene is "
+            "part of them and is learned as solid content. Give the background's color instead (scene.background=black "
+            "or white).",
             scene.background,
             scene.name,
         )
@@ -190,8 +190,8 @@ def _check_patch(scene: Scene, patch: int, batch_rays: int) -> None:
     if batch_rays % together:
         fitting = max(1, round(batch_rays / together)) * together
         raise InputError(
-            f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is no multiple "
-            f"of that. Give data.batch_rays={fitting}, or a smaller loss.patch."
+            f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is not a "
+            f"multiple of that. Give data.batch_rays={fitting}, or a smaller loss.patch."
         )
     train = torch.tensor(scene.splits.get("train", ()), dtype=torch.int64)
     small = train[torch.minimum(scene.pixels.width, scene.pixels.height)[train] < patch].tolist()

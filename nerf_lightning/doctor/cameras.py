@@ -32,7 +32,7 @@ def rigid(evidence: Given) -> Check:
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
     if bad:
         cure = "Take scale and mirror out of the rotations; the centers keep them."
-        return wrong(f"{evidence.named(bad)} have poses that are no rotations", cure)
+        return wrong(f"{evidence.named(bad)} have poses that are not rotations", cure)
     size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
         cure = "Walk around: depth is seen only from different places. Or the centers were lost in the conversion."
@@ -73,11 +73,11 @@ def upright(evidence: Given) -> Check:
     right_up, up_up = (up @ scene.cameras.c2w[:, :, column].T for column in (0, 1))
     sideways = float((right_up.abs() > 0.7).float().mean())
     if sideways > 0.5:
-        cure = "Training does not mind. For upright pictures turn the photographs and estimate the poses anew."
+        cure = "Training is not affected. For upright pictures, rotate the photographs and estimate the poses again."
         return look(f"{100 * sideways:.0f} % of the photographs lie on their side", cure)
     if float(up_up.median()) < -0.1:
         cure = "Turn the world so that up is +z (or check the axes); else videos and orbits are upside down."
-        return look("most photographs stand on their head: up is not +z", cure)
+        return look("most photographs are upside down: up is not +z", cure)
     return ok("the photographs are upright")
 
 
@@ -117,7 +117,7 @@ def principal_point(evidence: Given) -> Check:
     is_other_size = float((usual - 0.5).abs().max()) >= FAR_OFF_CENTER
     if is_other_size and float((usual[0] - usual[1]).abs()) < 0.03:
         message += f": it belongs to photographs of {factor:.2g} times the size, it seems"
-    cure = "Give cx, cy (and the focal length) in pixels of the width and height beside them; cropped is fine."
+    cure = "Give cx, cy (and the focal length) in pixels of the given width and height; cropped is fine."
     return (wrong if is_other_size else look)(message, cure)
 
 
@@ -144,7 +144,7 @@ def number_of_views(evidence: Given) -> Check:
     splits = evidence.scene.splits
     count = len(splits["train"])
     held = len(set(splits["val"]) | set(splits["test"]))
-    message = f"{count} to learn from, {held} held out"
+    message = f"{count} for training, {held} held out"
     if count >= FEW:
         return ok(message)
     cure = "Take more photographs: 15 or more of a scene seen from the front, 50 to 100 all around."
@@ -156,16 +156,16 @@ def splits(evidence: Evidence) -> Check:
     parts = {split: set(views) for split, views in evidence.scene.splits.items()}
     both = sorted(parts["train"] & (parts["val"] | parts["test"]))
     if both:
-        cure = "Take them out of one of the two lists; else the scores say nothing of new views."
-        return wrong(f"{evidence.named(both)} are learned from and held out at once", cure)
+        cure = "Remove them from one of the two lists; otherwise scores say nothing about new views."
+        return wrong(f"{evidence.named(both)} are both trained on and held out", cure)
     held = sorted(parts["val"] | parts["test"])
     angles = _degrees_to_nearest(evidence.scene, held, sorted(parts["train"]))
     lonely = [view for view, angle in zip(held, angles.tolist(), strict=True) if angle > FAR_HELD_OUT]
     if lonely:
-        message = f"{evidence.named(lonely)} are seen from over {FAR_HELD_OUT:.0f} degrees away from any training view"
+        message = f"{evidence.named(lonely)} are more than {FAR_HELD_OUT:.0f} degrees away from any training view"
         return look(message, "Expect low scores there; hold out other views, or add photographs.")
     far = f"; the farthest lies {float(angles.max()):.0f} degrees from a training view" if len(held) else ""
-    return ok(f"no view is in training and held out at once{far}")
+    return ok(f"no view is both in training and held out{far}")
 
 
 def left_out(evidence: Evidence) -> Check:
@@ -175,7 +175,7 @@ def left_out(evidence: Evidence) -> Check:
         return ok("none")
     total = len(missing) + len(evidence.scene.view_names)
     message = f"{len(missing)} of {total} photographs have no pose: {listed(missing, cap=5)}"
-    cure = "Were they needed, take photographs between them and the others and estimate the poses anew (nerf poses)."
+    cure = "If they are needed, take photographs between them and the others and estimate the poses again (nerf poses)."
     return look(message, cure)
 
 

@@ -11,7 +11,7 @@ from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
-SHIFT = "Shift the list of photographs against the poses by one; one end may lack a picture."
+SHIFT = "Shift the list of photographs by one relative to the poses; a picture may be missing at one end."
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,12 @@ AXES = (
         _poses(lambda c2w: axes(transposed(c2w), FLIP_YZ)),
     ),
     Reading(
-        "as if the axes x and y of the cameras had the other sign",
+        "as if the cameras' x and y axes were negated",
         "Negate columns 1 and 2 of every rotation.",
         _poses(lambda c2w: axes(c2w, (-1.0, -1.0, 1.0))),
     ),
     Reading(
-        "as if the axes x and z of the cameras had the other sign",
+        "as if the cameras' x and z axes were negated",
         "Negate columns 1 and 3 of every rotation.",
         _poses(lambda c2w: axes(c2w, (-1.0, 1.0, -1.0))),
     ),
@@ -108,7 +108,7 @@ PHOTOGRAPHS = (
     Reading("as if the photographs were mirrored, left to right", "Mirror them back.", _pictures(-1.0, 1.0)),
     Reading(
         "as if the photographs were mirrored, top to bottom",
-        "Turn the rows of the photographs over.",
+        "Flip the photographs top to bottom.",
         _pictures(1.0, -1.0),
     ),
 )

@@ -35,7 +35,7 @@ def near_and_far(evidence: Evidence) -> Check:
         if before <= FEW:
             return ok(f"{100 * (1 - before):.0f} % of the content lies beyond the near plane (NDC)")
         return (wrong if before > MANY else look)(
-            f"{100 * before:.0f} % of the content lies before the near plane of the normalized device coordinates",
+            f"{100 * before:.0f} % of the content lies in front of the near plane of the normalized device coordinates",
             f"Set scene.near to about {0.9 * float(distance.quantile(0.01)) * unit:.3g} (it is {unit:.3g}).",
         )
     before = float((distance < scene.near[view]).float().mean())

@@ -35,9 +35,9 @@ def require_sound(scene: Scene) -> list[Check]:
     if wrong:
         first, others = wrong[0], ", ".join(check.name for check in wrong[1:])
         raise InputError(
-            f"The capture {scene.name} cannot be trained on. {first.name}: {first.message}. {first.cure}"
-            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all findings, with a figure; "
-            "doctor=off trains anyway."
+            f"The capture {scene.name} cannot be trained "
+            f"on. {first.name}: {first.message}. {first.cure}{f' Also wrong: {others}.' if others else ''} nerf doctor "
+            "shows all findings, with a figure; doctor=off trains anyway."
         )
     unknown = [check.name for check in checks if check.verdict == "not judged"]
     left = f"; not judged: {', '.join(unknown)}" if unknown else ""

@@ -43,7 +43,7 @@ def duplicates(evidence: Evidence) -> Check:
     pairs = " and ".join(evidence.named([view]) for view in same[0].tolist())
     message = f"{len(same)} pairs of photographs are all but identical, such as {pairs}"
     if leak:
-        message += f"; {len(leak)} of them are in training and held out at once, so scores will be too good"
+        message += f"; {len(leak)} of them are both in training and held out, so scores will be too good"
     return look(message, "Remove one of each (scene.frames, or from the file).")
 
 

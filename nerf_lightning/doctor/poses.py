@@ -63,7 +63,7 @@ def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     message += f"; {len(against)} of {len(pairs)} pairs whose details fit each other contradict the poses"
     if share <= 1 - MOST_AGAINST:
         return ok(message)
-    cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
+    cure = "See the other verdicts for the cause; if they name none, estimate the poses again (nerf poses)."
     if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
         return look(message, cure)
     return wrong(message, cure, (against[0],))
@@ -137,7 +137,7 @@ def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[in
         + "; ".join([*swapped, *turned][:MOST_TOLD]),
         "Give each photograph its own pose (swap them back), or remove these views (scene.frames, or from the file)."
         if swapped
-        else "Remove these views (scene.frames, or from the file), or estimate their poses anew.",
+        else "Remove these views (scene.frames, or from the file), or estimate their poses again.",
         tuple(proof for pose in better for proof in _proof_of(evidence, pose)),
     )
 
@@ -231,7 +231,7 @@ def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -
     best = max(range(len(readings)), key=shares.__getitem__)
     if shares[best] < max(given + BETTER, HOPELESS):
         if given < HOPELESS:
-            return not_judged("too few details lie where the cameras say, by any reading", DOUBTFUL)
+            return not_judged("too few details lie where the cameras say, under any convention", DOUBTFUL)
         return ok(f"{fine}: no other convention fits the images better")
     poses, changed = readings[best].change(scene, evidence.matches)
     fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None

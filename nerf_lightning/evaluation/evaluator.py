@@ -165,7 +165,7 @@ def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:
         share, name = max(unseen)
         log.warning(
             "%d of %d views have pixels whose rays no photograph sees, up to %.1f %% of a view (%s): they show the "
-            "background, which is no guess of what is there.",
+            "background, which says nothing about what is there.",
             len(unseen),
             len(rows),
             100.0 * share,

@@ -18,9 +18,9 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LPIPS_HINT = (
-    "it needs the weights of a backbone: where torchvision is installed, run "
-    "`torch.save(torchvision.models.alexnet(weights='DEFAULT').state_dict(), 'alexnet.pth')`, "
-    "copy the file here and set evaluation.lpips_weights=alexnet.pth (vgg16 in place of alexnet for the net vgg)"
+    "it needs the weights of a backbone: on a machine with torchvision, run "
+    "`torch.save(torchvision.models.alexnet(weights='DEFAULT').state_dict(), 'alexnet.pth')`, copy the file here and "
+    "set evaluation.lpips_weights=alexnet.pth (for the net vgg, vgg16 instead of alexnet)"
 )
 
 Net = Literal["alex", "vgg"]

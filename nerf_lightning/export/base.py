@@ -66,15 +66,15 @@ def refuse_ndc(record: SceneRecord, what: str) -> None:
     """Refuse a scene whose field lives in normalized device coordinates."""
     if record.space == "ndc":
         raise InputError(
-            f"what={what}: {record.name} was trained in normalized device coordinates (scene.space=ndc), where far "
-            "things have no box. Use what=points or what=images, or train again with scene.space=contracted."
+            f"what={what}: {record.name} was trained in normalized device coordinates (scene.space=ndc), where distant "
+            "content has no box. Use what=points or what=images, or train again with scene.space=contracted."
         )
 
 
 def require_free(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> None:
     """Refuse places for files where folders lie, and for folders where files lie: before the work, not after it."""
-    taken = [f"{path} is a folder, and a file of that name is to be written" for path in files if path.is_dir()]
+    taken = [f"{path} is a folder, but a file of that name is to be written" for path in files if path.is_dir()]
     filled = [path for path in folders if path.exists() and not path.is_dir()]
-    taken += [f"{path} is a file, and a folder of that name is to be filled" for path in filled]
+    taken += [f"{path} is a file, but a folder of that name is to be filled" for path in filled]
     for reason in taken:
         raise InputError(f"{reason}. Remove it, or give another place with paths.output_dir=DIR.")

@@ -82,7 +82,7 @@ class PageExport(Export):
         """Write the page, and say what it costs."""
         target = folder / "page.html"
         if target.is_dir() or (target.exists() and not is_page(target)):
-            kind = "a folder" if target.is_dir() else "a file that is no page of this program"
+            kind = "a folder" if target.is_dir() else "a file that is not a page of this program"
             raise InputError(f"{target} is {kind}, and would be lost. Move it away, or give paths.output_dir=DIR.")
         marks = self._marks(record, folder)
         with StageProgress(COSTS) as report:

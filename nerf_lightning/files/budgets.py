@@ -83,6 +83,6 @@ def require_within(name: str, found: int, where: str, what: str) -> None:
     most = getattr(limits(), name)
     if found > most:
         raise InputError(
-            f"{where} has {found:,} {what}, more than the limit of {most:,}. If you trust it, "
-            f"add budgets.{name}={found}; else use another file."
+            f"{where} has {found:,} {what}, more than the limit of {most:,}. If you trust it, add "
+            f"budgets.{name}={found}; otherwise use another file."
         )

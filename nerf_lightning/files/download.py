@@ -49,11 +49,11 @@ def _received(url: str, num_bytes: int, sha256: str | None) -> bytes:
     parts = urlsplit(url)
     # Nobody else's answer is believed.
     if parts.scheme != "https" and not (parts.scheme == "http" and (sha256 or parts.hostname in LOCAL)):
-        raise ValueError(f"{url} is not an https address, and without a checksum nothing else is trusted")
+        raise ValueError(f"{url} is not an https address, which is needed without a checksum")
     with urlopen(Request(url, headers={"User-Agent": "nerf-lightning"}), timeout=TIMEOUT) as response:
         content: bytes = response.read(num_bytes + 1)
     if len(content) != num_bytes:
-        raise ValueError(f"the file should have {num_bytes} bytes, and {len(content)} came")
+        raise ValueError(f"the file should have {num_bytes} bytes, but {len(content)} came")
     found = hashlib.sha256(content).hexdigest()
     if sha256 not in (None, found):
         raise ValueError(f"its checksum is {found}, not {sha256}")

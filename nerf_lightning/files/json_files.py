@@ -12,7 +12,7 @@ from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
-CURE = "Export it again, or mend it with a json checker."
+CURE = "Export it again, or fix it with a JSON checker."
 
 
 def read_json(path: Path) -> Any:
@@ -34,7 +34,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
-        raise ValueError(f"the key {twice[:200]!r} stands twice in one object, and which one holds is not clear")
+        raise ValueError(f"the key {twice[:200]!r} appears twice in one object, and it is unclear which one applies")
     return content
 
 

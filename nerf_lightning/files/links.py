@@ -12,8 +12,8 @@ def require_no_way_out(folder: Path) -> None:
     """Refuse to write into a folder with links that lead out of it: an unpacked archive may have brought them."""
     for path in _ways_out(folder):
         raise InputError(
-            f"{path} is a symbolic link to {os.readlink(path)}, and writing into {folder} would write there. "
-            "Remove the link (or put what it names in its place), or give another folder with paths.output_dir=DIR."
+            f"{path} is a symbolic link to {os.readlink(path)}, so writing into {folder} would write there. Remove the "
+            "link (or replace it with what it points to), or give another folder with paths.output_dir=DIR."
         )
 
 
@@ -22,7 +22,7 @@ def require_nothing_from_outside(folder: Path) -> None:
     for path in _ways_out(folder):
         raise InputError(
             f"{path} is a symbolic link to {os.readlink(path)}, which lies outside of {folder} and would be shown. "
-            "Remove the link, or put what it names in its place."
+            "Remove the link, or replace it with what it points to."
         )
 
 

@@ -25,7 +25,7 @@ def below(root: Path, *names: str) -> Path:
         place = place / name
         if place.is_symlink():
             raise InputError(
-                f"{place} is a symbolic link to {place.readlink()}, and writing into {root} would write there. Remove "
+                f"{place} is a symbolic link to {place.readlink()}, so writing into {root} would write there. Remove "
                 "the link, or give another folder with paths.output_dir=DIR."
             )
     return place
@@ -87,8 +87,8 @@ def require_run(folder: Path) -> None:
     """Refuse to write to the folder of a run that is gone."""
     if not (folder / "run.json").is_file():
         raise InputError(
-            f"The run folder {folder} was deleted, moved or renamed while the run was going on, so it stops here. If "
-            "the folder has another name now, go on with resume=NEW_NAME."
+            f"The run folder {folder} was deleted, moved or renamed during the run, so the run stops here. If the "
+            "folder has another name now, continue with resume=NEW_NAME."
         )
 
 

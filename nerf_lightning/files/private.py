@@ -27,9 +27,8 @@ def make_own_folder(folder: Path, setting: str = SETTING) -> None:
     reason = whose(os.stat(folder))
     if reason is not None:
         raise InputError(
-            f"The folder {folder} {reason}, so what is kept there may be a stranger's. If you made it, and all that "
-            f"lies there, keep others out (chmod 700 '{folder}'); else name a folder of your own with "
-            f"{setting}."
+            f"The folder {folder} {reason}, so its contents may come from somebody else. If you made it and everything "
+            f"in it, make it private (chmod 700 '{folder}'); otherwise choose a folder of your own with {setting}."
         )
 
 
@@ -40,11 +39,11 @@ def open_own(path: Path, most_bytes: int | None) -> BufferedReader:
         InputError: it belongs to somebody else, can be written by others, is a link or no regular file, or is larger.
         OSError: it cannot be opened.
     """
-    file = open_regular(path, most_bytes, "Remove it, and it is made anew.", follow_links=False)
+    file = open_regular(path, most_bytes, "Remove it, and it will be made again.", follow_links=False)
     reason = whose(os.fstat(file.fileno()))
     if reason is not None:
         file.close()
-        raise InputError(f"{path} {reason}, so it may be a stranger's. Remove it, and it is made anew.")
+        raise InputError(f"{path} {reason}, so it may come from somebody else. Remove it, and it will be made again.")
     return file
 
 

@@ -26,7 +26,7 @@ KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-CURE = "It was damaged or made by somebody else: put a sound copy in its place, or remove it."
+CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
 
 
 def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
@@ -130,4 +130,4 @@ def _of_another_kind(path: Path, kind: str, cure: str) -> str:
 
 
 def _too_large(path: Path, size: int, most_bytes: int, cure: str) -> str:
-    return f"{path} has {size:,} bytes, and more than {most_bytes:,} are not read here. {cure}"
+    return f"{path} has {size:,} bytes, more than the limit of {most_bytes:,}. {cure}"

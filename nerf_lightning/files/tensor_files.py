@@ -70,7 +70,7 @@ def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
         if announced > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise InputError(
                 f"{path} has {size:,} bytes and unpacks to {announced:,}: PyTorch saves without compression, so this "
-                "file was made to fill the memory, or packed by another program. Use the file as it was saved."
+                "file was made to fill memory, or packed by another program. Use the file as it was saved."
             )
         # torch.load compares no checksums: a block of zeros in the middle of the weights would be believed.
         damaged = archive.testzip()
@@ -105,8 +105,8 @@ def _made_anew(node: Any, path: Path, made: dict[int, Any]) -> Any:
     if isinstance(node, Tensor):
         if node.numel() * node.element_size() > node.untyped_storage().nbytes():
             raise InputError(
-                f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: whatever is "
-                "done with it would fill the memory. This program saves none such; use another file."
+                f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: using it would fill "
+                "memory. This program saves no such tensors; use another file."
             )
         return node.detach()
     if id(node) in made or not isinstance(node, (dict, list, tuple, set)):

@@ -108,7 +108,7 @@ def require_printable(name: str, where: str) -> None:
     if len(name) > MOST_CHARACTERS or not is_plain(name):
         raise InputError(
             f"{where} has the name '{for_terminal(name[:200])}', which holds control characters, is not UTF-8 or has "
-            f"more than {MOST_CHARACTERS} characters. Rename it, in the files that list it too."
+            f"more than {MOST_CHARACTERS} characters. Rename it, also in the files that list it."
         )
 
 

@@ -221,4 +221,4 @@ def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
         key = key_of(override)
         for setting, instead in OF_LIGHTNINGS_TRAINER.items():
             if key == setting or key.startswith((f"{setting}.", f"{setting}@")):
-                raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")
+                raise InputError(f"{override}: here, this is a setting of Lightning's Trainer: {instead}.")

@@ -99,7 +99,7 @@ class TrainedModel:
             InputError: the model knows only its own scene, or cannot render from these photographs.
         """
         if not self.module.needs_photographs:
-            raise InputError(f"This model knows the scene {self.scene.name} alone, and no other can be shown to it.")
+            raise InputError(f"This model can render only its own scene, {self.scene.name}.")
         shown = shown_capture(scene)
         show_photographs(self.module, shown)
         return replace(self, checkpoint=replace(self.checkpoint, scene=scene_record(shown), given_cameras=None))
@@ -163,5 +163,5 @@ def _one(camera: Cameras) -> Cameras:
     if camera.c2w.dim() == 2:
         return camera.map(lambda tensor: tensor[None])
     if camera.c2w.shape[0] != 1:
-        raise InputError(f"These are {camera.c2w.shape[0]} cameras, and render takes one: cameras[0].")
+        raise InputError(f"These are {camera.c2w.shape[0]} cameras, but render takes one: cameras[0].")
     return camera

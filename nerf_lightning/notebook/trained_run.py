@@ -69,6 +69,6 @@ def _require_one_process(trainer: Any) -> None:
     device_type = choose_device(trainer.accelerator)[0]
     if trainer.launched_by != "nerf" or num_processes(trainer.devices, device_type) > 1:
         raise InputError(
-            "nl.train trains in this one process, and this trainer wants several. Use nerf train for that, and "
+            "nl.train trains in this one process, but this trainer needs several. Use nerf train for that, and "
             "nl.load(RUN) afterwards; or trainer.devices=1."
         )

@@ -227,9 +227,8 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
     if begun_with is None:
         raise InputError(
             f"{note} is {'damaged' if note.stat().st_size else 'empty'}, so it does not say which run this is. Remove "
-            "it: then a run with the settings of that one (.hydra/overrides.yaml) and "
-            f"{to_type('paths.output_dir', str(folder))} goes on from its checkpoints. Or give another folder with "
-            "paths.output_dir=DIR."
+            f"it; a run with the same settings (.hydra/overrides.yaml) and {to_type('paths.output_dir', str(folder))} "
+            "then resumes from its checkpoints. Or give another folder with paths.output_dir=DIR."
         )
     if begun_with == fingerprint(identity):
         if resuming:
@@ -242,11 +241,11 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
     newer = _newer_settings(folder, identity, other) if isinstance(other, dict) and resuming else []
     if newer and not typed & set(newer):
         shown = ", ".join(f"{key}={identity[key]}" for key in newer)
-        log.warning("The run in %s was begun before there were these settings, and goes on with %s.", folder, shown)
+        log.warning("The run in %s was started before these settings existed, and continues with %s.", folder, shown)
         return
     difference = _difference(identity, other) if isinstance(other, dict) else other
     raise InputError(
-        f"{folder} is occupied by a run of another config ({difference}). Give the settings that it was started with "
+        f"{folder} contains a run with other settings ({difference}). Give the settings that it was started with "
         "(.hydra/overrides.yaml), or another folder with paths.output_dir=DIR."
     )
 

@@ -71,7 +71,7 @@ def find_results(
         there = " and the models ".join(map(listed, known))
         given = {"scenes": scenes, "models": models}
         asked = " and ".join(f"{key}=[{','.join(names)}]" for key, names in given.items() if names is not None)
-        raise InputError(f"No run fits {asked}. There are the scenes {there}.")
+        raise InputError(f"No run matches {asked}. The scenes are {there}.")
     return FoundResults(FILES[measured], chosen, [run for run, result in read.items() if result is None])
 
 
@@ -95,7 +95,7 @@ def _runs_below(folder: Path) -> Iterator[Path]:
     for count, (base, below, names) in enumerate(walk(folder)):
         if count > limits().folders:
             raise InputError(
-                f"{folder} holds more than {limits().folders:,} folders. Name the runs more closely, or add "
+                f"{folder} holds more than {limits().folders:,} folders. Name the runs more specifically, or add "
                 "budgets.folders=N."
             )
         below.sort()

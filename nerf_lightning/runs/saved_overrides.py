@@ -32,7 +32,7 @@ def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
         return []
     lines = read_plain_yaml(saved)
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise InputError(f"{saved} is no list of overrides: it is damaged. Give the run's settings by hand.")
+        raise InputError(f"{saved} is not a list of overrides: it is damaged. Give the run's settings by hand.")
     return list(_repeated(lines, arguments, saved, of_sweep=False))
 
 
@@ -68,10 +68,9 @@ def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sw
         if override is None or not _is_harmless(override, of_sweep):
             flag, kind = ("sweep.resume=true", "sweep") if of_sweep else ("resume=", "run")
             raise InputError(
-                f"{saved} holds {line[:200]!r}, which is not repeated from a file: what names a class, looks something "
-                "up, says where to write, what to fetch and how far to trust, or is no setting that this program "
-                "knows, is taken from the command line alone. If it is yours, type it again after "
-                f"{flag}; else do not go on with this {kind}."
+                f"{saved} holds {line[:200]!r}, which is not taken from a file: settings that name a class, look "
+                "something up, say where to write, what to fetch or what to trust, or are unknown, must be typed. If "
+                f"this one is yours, type it again after {flag}; otherwise do not resume this {kind}."
             )
         yield line
 

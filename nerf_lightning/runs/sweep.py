@@ -70,7 +70,7 @@ class SweepWatch(Callback):
             leftover.unlink(missing_ok=True)
         record.write(sweep.folder)
         if "sweep" in config:
-            said = f"sweep folder {sweep.folder}; after a stop, resume with: {sweep.go_on_with()}"
+            said = f"sweep folder {sweep.folder}; if it stops, resume with: {sweep.go_on_with()}"
             print(for_terminal(said), file=sys.stderr)
         # Optuna's database library lists its parts.
         logging.getLogger("alembic").setLevel(logging.WARNING)

@@ -79,7 +79,7 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
         return None
     except (SystemExit, KeyboardInterrupt) as stop:
         if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started
-            replace(record, state="failed", reason="its processes have said why").write(sweep_folder)
+            replace(record, state="failed", reason="see its messages above").write(sweep_folder)
             return None
         replace(record, state="stopped").write(sweep_folder)
         # joblib would kill the other jobs before they have saved.

@@ -47,6 +47,6 @@ def read_sweep(sweep_folder: Path) -> SweepRecord | None:
     content = read_plain_yaml(record)
     arguments = content.get("arguments") if isinstance(content, dict) else None
     if not isinstance(arguments, list) or not all(isinstance(argument, str) for argument in arguments):
-        raise InputError(f"{record} is no record of a sweep. {CURE}")
+        raise InputError(f"{record} is not a record of a sweep. {CURE}")
     job = content.get("slurm_job")
     return SweepRecord(arguments, job if isinstance(job, str) else None)

@@ -66,7 +66,7 @@ def result_table(found: FoundResults, order: str, published: bool, force: bool) 
         notes += [f"{key}: {', '.join(values)}"] if len(values) > 1 else []
     if left_out:
         names = listed((result.folder for result in left_out), cap=5)
-        notes.append(f"Left out, since newer runs of the same settings and seed are there: {names}.")
+        notes.append(f"Left out, because there are newer runs with the same settings and seed: {names}.")
     if found.unmeasured:
         notes.append(f"Without a PSNR in {found.file}: {listed(found.unmeasured, cap=5)}.")
     columns = [name for name in rows[0] if any(row[name] not in (None, "") for row in rows)]
@@ -89,13 +89,13 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
             apart = _apart(other, result, same_scene)
             if apart and not force:
                 raise InputError(
-                    f"{other.folder} and {result.folder} were not measured alike ({'; '.join(apart)}), so their "
-                    "numbers do not belong into one table. Leave one out (scenes=..., models=..., or fewer runs), "
-                    "measure both alike with nerf eval and add measured=eval, or add force=true."
+                    f"{other.folder} and {result.folder} were not measured the same way ({'; '.join(apart)}), so one "
+                    "table cannot compare them. Leave one out (scenes=..., models=..., or fewer runs), measure both "
+                    "the same way with nerf eval and add measured=eval, or add force=true."
                 )
             for difference in apart:
                 pairs.setdefault(difference, f"{other.folder} and {result.folder}")
-    return [f"Not all of these were measured alike: {pair}: {difference}." for difference, pair in pairs.items()]
+    return [f"Not all of these were measured the same way: {pair}: {difference}." for difference, pair in pairs.items()]
 
 
 def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
@@ -110,14 +110,18 @@ def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
             " and ".join(f"{key}={each[key]}" if key in each else "its default" for each in chosen)
             for key in differing_keys(chosen)
         ]
-        cause = "by the same settings: the capture was changed in between"
-        told.append(f"other pictures, {f'of {listed(differing, cap=3)}' if differing else cause}")
+        cause = "although the settings are the same: the capture has changed"
+        told.append(f"different views: {listed(differing, cap=3)}" if differing else f"different views, {cause}")
     return told
 
 
 def _chooses_pictures(key: str) -> bool:
     is_of_scene = key == "scene" or key.startswith("scene.")
-    return (is_of_scene and meaning_of(key).identity) or key in ("evaluation.split", "evaluation.max_views")
+    return (is_of_scene and meaning_of(key).identity) or key in (
+        "evaluation.split",
+        "evaluation.max_views",
+        "experiment",
+    )
 
 
 def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResult]]:

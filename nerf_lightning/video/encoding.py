@@ -193,7 +193,7 @@ def require_ffmpeg() -> str:
     try:
         program = str(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
-        raise InputError(f"A video needs ffmpeg, and there is none. {_CURE}") from error
+        raise InputError(f"A video needs ffmpeg, which is not installed. {_CURE}") from error
     if shutil.which(program) is None:
         raise InputError(f"ffmpeg ({program}) does not start: there is no such program. {_CURE}")
     return program

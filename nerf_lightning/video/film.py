@@ -95,13 +95,13 @@ def _check(subjects: list[Subject], settings: FilmSettings) -> None:
     if settings.form == "exr":
         require_openexr()
     if (settings.alpha or settings.form == "exr") and len(subjects) > 1:
-        raise InputError("alpha=true and format=exr take one checkpoint: several stand side by side on white paper.")
+        raise InputError("alpha=true and format=exr take one checkpoint: several are shown side by side on white.")
     for subject in subjects:
         name = f" ({subject.label})" if len(subjects) > 1 else ""
         if "levels" in settings.outputs and subject.model.first_picture is None:
             raise InputError(
-                f"outputs: this model{name} has one level that makes pictures, and levels shows how two differ, as "
-                "those of model=nerf. Leave levels out."
+                f"outputs: this model{name} renders one level, and levels shows how two differ, as in model=nerf. "
+                "Leave out levels."
             )
         if settings.crop is not None and subject.background == "none" and not settings.alpha:
             raise InputError(

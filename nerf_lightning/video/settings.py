@@ -45,7 +45,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
     """Return what is to be filmed, by settings that are plain values; those that make no film are refused."""
     for name in SWITCHES:
         if not isinstance(config[name], bool):
-            raise InputError(f"{name}={config[name]} does not fit: it must be true or false.")
+            raise InputError(f"{name}={config[name]} is not valid: it must be true or false.")
     outputs = tuple(map(str, as_list(config["outputs"])))
     if not outputs or len(set(outputs)) < len(outputs) or not all(map(str.isidentifier, outputs)):
         raise InputError(
@@ -76,7 +76,7 @@ def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
     elif config["background"] is not None:
         reason = f"background={config['background']} would lie behind the scene. Leave one of the two out"
     elif config["mosaic"]:
-        reason = "mosaic=true sets pictures on white paper. Leave one of the two out"
+        reason = "mosaic=true puts pictures on white. Leave one of the two out"
     elif "rgb" not in outputs:
         reason = "the colors get it, and outputs has no rgb"
     else:

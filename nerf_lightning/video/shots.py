@@ -199,8 +199,8 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
     """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
     if scene.cameras.ndc is not None:
         raise InputError(
-            f"projection=equirectangular looks to all sides, and {scene.name} was learned in normalized device "
-            "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted."
+            f"projection=equirectangular looks in all directions, but {scene.name} was trained in normalized device "
+            "coordinates, which contain only what is in front of its cameras. Train with scene.space=contracted."
         )
     if path.fov is not None:
         raise InputError(f"path.fov={path.fov:g} with projection=equirectangular: panoramas show all directions.")
@@ -227,8 +227,8 @@ def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
     count = len(cameras.c2w)
     if lost := int((~in_front_of_near_plane(cameras)).sum()):
         log.warning(
-            f"{lost} of {count} cameras of the path look aside or stand among the content, where the forward-facing "
-            f"capture {scene.name} has nothing to show: their pictures mean nothing. Use path=spiral."
+            f"{lost} of {count} cameras of the path look aside or are inside the content, where the forward-facing "
+            f"capture {scene.name} shows nothing. Use path=spiral."
         )
     return replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
 
@@ -250,4 +250,6 @@ def _check_near(scene: SceneRecord, clip: Clip | None, far_end: Float[Tensor, "f
     far = float(far_end.max())
     if clip.near >= far:
         unit = unit_of(scene.to_user)
-        raise InputError(f"near={unit * clip.near:g} leaves nothing to see: rays end at {unit * far:g}. Give less.")
+        raise InputError(
+            f"near={unit * clip.near:g} leaves nothing to see, because rays end at {unit * far:g}. Give a smaller one."
+        )

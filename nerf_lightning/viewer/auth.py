@@ -11,7 +11,7 @@ LOCAL = ("127.0.0.1", "localhost", "[::1]")
 # A machine's name or address, and perhaps a port.
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::[0-9]{1,5})?")
 NO_TOKEN = "The access token is missing: open the whole address that nerf printed, with ?token=..."
-FOREIGN = "This request comes from another site, which may not speak to this page."
+FOREIGN = "This request comes from another site, which may not access this page."
 
 
 class Auth:
@@ -65,7 +65,7 @@ def names_of(hosts: Sequence[str] | str | None) -> set[str]:
         name = name_of(str(each).lower())
         if name is None:
             raise InputError(
-                f"viewer.hosts: {each!r} is no name of a machine: give names of machines like castle.example or "
+                f"viewer.hosts: {each!r} is not the name of a machine: give names such as castle.example or "
                 "192.168.1.5."
             )
         names.add(name)

@@ -19,7 +19,7 @@ class PhotographPanel:
         gui, harmless = session.client.gui, session.queue.errors.harmless
         labels = (f"{view}: {one_line(name, MOST_LETTERS)}" for view, name in enumerate(self.names))
         with gui.add_folder("Photographs", expand_by_default=False):
-            visible = gui.add_checkbox("Show cameras", False, hint="Those may be clicked, too")
+            visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
             self.choice = gui.add_dropdown("Look through", (NONE, *labels), initial_value=NONE)
             self.name = gui.add_markdown("", visible=False)
             self.split = gui.add_slider(
@@ -37,7 +37,7 @@ class PhotographPanel:
         """Look through the camera of a view."""
         there = self.session.photographs.has(view)
         self.name.content = f"Through the camera of {as_plain_markdown(self.names[view])}" + (
-            "" if there else " (its photograph is not at hand)"
+            "" if there else " (its photograph is not available)"
         )
         self.choice.value = self.choice.options[view + 1]
         self.name.visible = self.leave.visible = True

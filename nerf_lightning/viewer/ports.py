@@ -18,7 +18,7 @@ def free_port(host: str, port: int) -> int:
             _try(host, candidate)
         except PermissionError as error:
             raise InputError(
-                f"port={candidate}: this user may not listen on it ({error.strerror}). Give a port from 1024 on."
+                f"port={candidate}: this user may not use it ({error.strerror}). Give a port from 1024 on."
             ) from error
         except OSError:
             continue
@@ -36,8 +36,8 @@ def require_address(host: str, port: int) -> None:
         _try(host, 0)
     except OSError as error:
         raise InputError(
-            f"host={host}: this machine cannot listen there ({error}). Use 127.0.0.1 (this machine alone), "
-            "0.0.0.0 (everybody who can reach it), or one of its own addresses."
+            f"host={host}: this machine cannot listen there ({error}). Use 127.0.0.1 (this machine only), 0.0.0.0 "
+            "(everybody who can reach it), or one of its own addresses."
         ) from error
 
 

@@ -68,7 +68,7 @@ def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 2, errors
     assert "could not be saved" in output
-    assert f"The former checkpoint {path} is unharmed" in output
+    assert f"The previous checkpoint {path} is intact" in output
     assert steps(path.parent) == {"last.ckpt": 1}
 
 
@@ -77,11 +77,11 @@ def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     (tmp_path / "run").write_text("a file")
-    with pytest.raises(InputError, match=r"run/checkpoints can be written, then go on with resume="):
+    with pytest.raises(InputError, match=r"run/checkpoints is writable, then continue with resume="):
         write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
     monkeypatch.setattr(os, "fsync", full)
     (tmp_path / "other").mkdir()
-    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
+    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then continue with resume="):
         write_checkpoint({"a": 1}, tmp_path / "other" / "checkpoints" / "last.ckpt")
 
 

@@ -89,7 +89,7 @@ def test_a_damaged_newest_is_recognised_and_the_one_before_is_used(tmp_path, dam
     assert found.step == 7
     assert found.weights["weight"].eq(7).all()
     assert len(caplog.records) == 1
-    assert "the one before is used instead" in caplog.text
+    assert "the previous one is used instead" in caplog.text
     assert "previous.ckpt, of step 7" in caplog.text
 
 

@@ -115,4 +115,4 @@ def test_of_more_pixels_than_memory_holds_some_rows_of_each_photograph_count(mon
 
 def test_going_on_all_the_same_is_said(caplog):
     require_same_capture(record(SCENE), record(reordered([1, 0, 2, 3, 4, 5])), allow_changed=True)
-    assert "the order of the photographs. What was learned of a photograph goes on with the one that now" in caplog.text
+    assert "the order of the photographs. What was learned about each photograph now applies" in caplog.text

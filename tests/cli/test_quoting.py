@@ -76,7 +76,7 @@ def test_quotes_come_off_again():
 
 @pytest.mark.parametrize("typed", ["scene.root= data/x", "scene = bricks", "scene.root data/x", "scene =bricks"])
 def test_spaces_around_the_equals_sign_are_told_in_one_paragraph(typed):
-    told = "settings are key=value without spaces: scene.root=data/x"
+    told = "Settings are key=value without spaces, such as scene.root=data/x"
     refused(require_settings, ["seed=1", *typed.split()], False, parts=(told,))
     if "=" in typed:  # where a path may stand alone, too
         refused(require_settings, typed.split(), True, parts=("without spaces",))

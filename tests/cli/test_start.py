@@ -65,7 +65,7 @@ def test_a_terminal_is_told_at_once_that_a_command_starts(monkeypatch, capsys, t
     monkeypatch.delitem(sys.modules, "torch", raising=False)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     announce_start("train", arguments)
-    assert capsys.readouterr().err.splitlines() == ["nerf train starts; loading PyTorch takes a few seconds"] * lines
+    assert capsys.readouterr().err.splitlines() == ["starting nerf train; loading PyTorch takes a few seconds"] * lines
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +79,7 @@ def _unknown(monkeypatch):
 def test_a_page_goes_without_photographs_and_says_so_unless_they_were_wished_for(caplog):
     typed = ["ckpt=a", "what=page"]
     assert prepare._export(typed) == ["photographs=false", *typed]
-    assert caplog.messages == ["what=page goes without photographs: nobody knows it"]
+    assert caplog.messages == ["what=page does not use photographs: nobody knows it"]
     with pytest.raises(UnknownScene):
         prepare._view(["ckpt=a", "photographs=True"])
     assert prepare._export(["ckpt=a", "what=cameras"]) == ["ckpt=a", "what=cameras"]

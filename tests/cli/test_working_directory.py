@@ -76,6 +76,6 @@ def test_settings_of_libraries_are_refused_before_anything_is_done(tmp_path, nam
     process = start_cold("nerf_lightning", *command, cwd=tmp_path)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert output.startswith(f"nerf: The working directory has a file {name}, which would be obeyed by ")
+    assert output.startswith(f"nerf: The working directory has a file {name}, which would be read by ")
     assert len(output.splitlines()) == 1
     assert not (tmp_path / "run").exists()

@@ -63,11 +63,11 @@ def test_a_gpu_that_is_not_there(nerf):
     ("override", "words"),
     [
         ("scene.near=7.0", "near"),
-        ("scene.near=close", "scene.near=close does not fit: it must be a number"),
+        ("scene.near=close", "scene.near=close is not valid: it must be a number"),
         ("trainer.precision=16-mixed", "it must be auto, 32-true, tf32, bf16-mixed"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),
-        ("path=photographs path.views=-1", "path.views=-1 does not fit: it must be a list or null"),
+        ("path=photographs path.views=-1", "path.views=-1 is not valid: it must be a list or null"),
         ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
@@ -77,17 +77,17 @@ def test_a_gpu_that_is_not_there(nerf):
         ("scene._target_=5", "See nerf train --help"),
         ("trainer.num_threads=0", "trainer.num_threads=0: give a number from 1 to 4096"),
         ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
-        ("init_from=[1]", "init_from=[1] does not fit: it must be a path"),
-        ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 does not fit: it must be a Field, chosen by"),
+        ("init_from=[1]", "init_from=[1] is not valid: it must be a path"),
+        ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 is not valid: it must be a Field, chosen by"),
         ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Fix optimizer.*"),
-        ("callbacks.monitor=5", "callbacks.monitor=5 is no callback. To do without one, add ~callbacks.monitor."),
-        ("budget=null", "budget=None does not fit: it holds settings, such as budget.seconds=VALUE"),
-        ("final=5", "final=5 does not fit: it holds settings, such as final.evaluate=VALUE"),
+        ("callbacks.monitor=5", "callbacks.monitor=5 is not a callback. To remove one, add ~callbacks.monitor."),
+        ("budget=null", "budget=None is not valid: it holds settings, such as budget.seconds=VALUE"),
+        ("final=5", "final=5 is not valid: it holds settings, such as final.evaluate=VALUE"),
         ("data.batch_rays=1000000000000", "data.batch_rays=1000000000000, which takes"),
         ("scene.aabb_half=inf", "scene.aabb_half is inf, but half the side of a box must be above 0"),
         ("scene.far=1e300", "scene.far is 1e+300, but rays need 0 <= near < far <= 1e+09"),
-        ("field=null", "A group was given something else than the name of one of its options"),
-        ("model=5", "A group was given something else than the name of one of its options"),
+        ("field=null", "A group was given something other than the name of one of its options"),
+        ("model=5", "A group was given something other than the name of one of its options"),
     ],
 )
 def test_a_bad_setting_is_named_before_a_folder_is_taken(train, tmp_path, override, words):
@@ -159,7 +159,7 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
 
 @pytest.mark.parametrize("command", ["render", "export what=cameras"])
 def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command):
-    said(nerf(*command.split(), "ckpt=[1]", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
+    said(nerf(*command.split(), "ckpt=[1]", f"paths.output_dir={tmp_path}/out"), "is not valid: it must be a path")
 
 
 def test_a_part_of_ones_own_that_is_not_found_says_where_python_looks(nerf, capture):

@@ -182,7 +182,7 @@ def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, 
     code, output = ended(process)
     assert code == 2, output
     (paragraph,) = [line for line in output.splitlines() if line.startswith("nerf: ")]
-    assert f"{tmp_path / 'run'} was deleted, moved or renamed while the run was going on" in paragraph
+    assert f"{tmp_path / 'run'} was deleted, moved or renamed during the run" in paragraph
     assert not (tmp_path / "run" / "run.json").exists()
     moved = tmp_path / "moved"
     step = saved(moved)["global_step"]
@@ -200,7 +200,7 @@ def test_a_cache_that_cannot_be_written_is_one_paragraph(nerf, photographs, tmp_
     settings = ("train", "scene=transforms", f"scene.root={photographs}", *FAST, *QUIET)
     said(
         nerf(*settings, "scene.cache_dir=/proc/self/cache", f"paths.output_dir={tmp_path / 'run'}"),
-        "cannot be kept in /proc/self/cache", "scene.cache_dir",
+        "cannot be cached in /proc/self/cache", "scene.cache_dir",
     )  # fmt: skip
     assert not (tmp_path / "run").exists()
 
@@ -210,7 +210,7 @@ def test_errors_that_follow_each_other_in_a_circle_are_one_paragraph(tmp_path):
     first, second = OSError(28, "No space left on device", str(tmp_path)), RuntimeError("closed")
     first.__context__, second.__context__ = second, first
     assert paragraph(first, "train") == (
-        f"{tmp_path}: No space left on device. See that the place exists, can be written, and has space left."
+        f"{tmp_path}: No space left on device. Check that the folder exists, is writable, and has free space."
     )
     second.__context__ = InputError("The run folder is gone.")
     assert paragraph(first, "train") == "The run folder is gone."

@@ -114,12 +114,12 @@ def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypa
 
 def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf):
     assert (
-        "optimizer.fused is a setting of optimizer=adam, and something else is chosen."
+        "optimizer.fused is a setting of optimizer=adam, which is not chosen."
         in nerf("train", "optimizer.fused=true").err
     )
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
     said(nerf("selftest", "experiment=quickstart"), "nerf selftest has no setting experiment. It belongs to training")
-    said(nerf("train", "+experiment=quickstart"), "leave the + out. Type experiment=quickstart.")
+    said(nerf("train", "+experiment=quickstart"), "leave out the +. Type experiment=quickstart.")
     said(nerf("train", "trainer.accumulate_grad_batches=2"), "accumulate_grad_batches is data.batch_rays")
     said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")
     said(nerf("train", "scene.downscale=2"), "scene=bricks is rendered, in the size scene.resolution=N")

@@ -71,7 +71,7 @@ def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
     if result.code:
         said(result, "There is nothing to export")
         return
-    assert "so this goes without them: The file" in result.err
+    assert "and are left out: The file" in result.err
     assert "against the photographs" not in result.out
     assert 'class="without"' in (tmp_path / "page.html").read_text()
 
@@ -82,7 +82,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     unwritten = nerf("export", f"ckpt={last}", "what=page", "paths.output_dir=/dev/null/x")
     said(unwritten, "The output folder /dev/null/x cannot be written", "paths.output_dir=DIR")
     said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "page")
-    said(nerf("export", f"ckpt={last}", "what.quality=vast", where), "what.quality=vast does not fit", "small, medium")
+    said(nerf("export", f"ckpt={last}", "what.quality=vast", where), "what.quality=vast is not valid", "small, medium")
     assert not list(tmp_path.iterdir())
 
 

@@ -64,7 +64,7 @@ def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
     result = train(export, "final.page=true")
     assert result.code == 0, result.err
     run = tmp_path / "run"
-    assert "The run is whole, but final.page failed: OSError: [Errno 28] No space" in result.err
+    assert "The run is complete, but final.page failed: OSError: [Errno 28] No space" in result.err
     assert f"nerf export ckpt={run} what=page writes it" in result.err
     assert not (run / "export").exists()
     assert "Traceback" not in result.err
@@ -119,7 +119,7 @@ def test_what_cannot_be_played_is_said_and_a_path_is_made(tmp_path, caplog):
     record(tmp_path / "viewer", "camera_path_001.yaml", 10, 5.0)
     (tmp_path / "viewer" / "camera_path_001.yaml").write_text("keyframes: 3")
     assert len(page_path(AutoPath(), scene, tmp_path)) == 25
-    assert "does not play what was recorded last" in caplog.text
+    assert "does not play the path that was recorded last" in caplog.text
     refused(page_path, PhotographPath(views=["absent"]), scene, tmp_path, parts=("absent",))
 
 

@@ -31,9 +31,9 @@ def test_a_gpu_that_fails_in_a_step_ends_with_the_way_to_go_on(
     assert f"The GPU has failed after step {failing_step}: {FAILURES[kind].splitlines()[0]}" in told
     assert "Traceback" not in result.err + result.out
     if saved_step is None:
-        assert "Nothing was saved yet: begin anew." in told
+        assert "Nothing was saved yet: start again." in told
         return
-    assert f"Go on from the last checkpoint with: nerf train resume={tmp_path}/run" in told
+    assert f"Resume from the last checkpoint with: nerf train resume={tmp_path}/run" in told
     assert saved(tmp_path / "run")["global_step"] == saved_step
     # The stand-in has gone with the command.
     assert train("trainer.max_steps=10", "final.evaluate=false", "final.video=false", "resume=auto").code == 0

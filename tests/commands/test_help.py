@@ -53,6 +53,11 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     ("words", "found"),
     [
         ("fog", "\n  * Fog disappears last"),
+        ("foggy", "\n  * Fog disappears last"),
+        ("crash", "nerf train resume=RUN_FOLDER"),
+        ("ssh", "ssh -L 8080:127.0.0.1:8080 MACHINE"),
+        ("compare runs", "nerf table  "),
+        ("film", "nerf render  "),
         ("blurry", "Blurred, although it trained long enough"),
         ("gray", "The picture is gray"),
         ("gpu", "\n  trainer=gpu  "),
@@ -78,6 +83,7 @@ def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
         (["help", "model=fats"], "Did you mean model=fast?"),
         (["render", "--help", "pth"], "Did you mean path?"),
         (["helpp"], "Did you mean help?"),
+        (["help", "add", "a", "loss"], "Nothing in the help has all these words: add a loss. Use fewer"),
         (["render", "--help", "optimizer"], "nerf render has no setting or group optimizer."),
     ],
 )

@@ -107,4 +107,4 @@ def test_a_folder_needs_no_quotes_and_a_line_may_end_as_on_windows(nerf, end):
 
 
 def test_spaces_around_the_equals_sign_are_told(nerf):
-    said(nerf("eval", "ckpt=", "data/x"), "settings are key=value without spaces: scene.root=data/x")
+    said(nerf("eval", "ckpt=", "data/x"), "Settings are key=value without spaces, such as scene.root=data/x")

@@ -81,7 +81,7 @@ def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, 
     assert codes == [2, 2, 0], said
     assert said.count("nerf: The checkpoint") == 2, said
     assert "No space left on device" in said
-    assert f"Free some space, then go on with resume={folder}." in said
+    assert f"Free some space, then continue with resume={folder}." in said
     assert "Traceback" not in said
     assert all(torch.equal(content["state_dict"][key], value) for key, value in never_killed["state_dict"].items())
 
@@ -95,7 +95,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(ca
     last.write_bytes(whole[: len(whole) // 2])
     codes, said, content = finish_after([], capture, folder)
     assert codes == [0], said
-    assert f"{last} is damaged; the one before is used instead" in said
+    assert f"{last} is damaged; the previous one is used instead" in said
     assert (folder / "checkpoints" / "damaged.ckpt").stat().st_size == len(whole) // 2
     for state in (finished, content):
         assert all(torch.equal(state["state_dict"][key], value) for key, value in never_killed["state_dict"].items())

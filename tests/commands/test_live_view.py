@@ -143,13 +143,13 @@ def test_nobody_looking_on_costs_nothing(trainer):
 
 def test_settings_of_the_page_that_cannot_be_are_refused_at_once():
     for share in (0.0, 1.0, -1.0):
-        with pytest.raises(InputError, match="give a part of the time between 0 and 1"):
+        with pytest.raises(InputError, match="give a share of the time between 0 and 1"):
             LiveView(share=share)
     with pytest.raises(InputError, match="cannot listen there"):
         LiveView(host="192.0.2.1")
     with pytest.raises(InputError, match="port=0"):
         LiveView(port=0)
-    with pytest.raises(InputError, match="no name of a machine"):
+    with pytest.raises(InputError, match="not the name of a machine"):
         LiveView(hosts=["a b"])
 
 
@@ -202,8 +202,8 @@ def test_a_paused_training_waits_until_somebody_lets_it_go_on(watched, caplog):
     watched.at_turn[5] = watched.callback.switch.go_on
     watched.step()
     assert watched.turns == 5
-    assert "the training pauses at step 0" in caplog.text
-    assert "the training goes on" in caplog.text
+    assert "training is paused at step 0" in caplog.text
+    assert "training continues" in caplog.text
     watched.step()
     assert watched.trainer.should_stop is False
 
@@ -274,7 +274,7 @@ def test_a_training_stopped_in_the_page_is_saved_and_evaluated(capture, tmp_path
     client.set("Stop training", True)
     output, _ = watched.communicate(timeout=120)
     assert watched.returncode == 0, output
-    assert "the training was stopped in the page at step" in output
+    assert "training was stopped from the page at step" in output
     assert "Traceback" not in output
     assert (tmp_path / "run" / "metrics.json").is_file()
     content = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)

@@ -63,7 +63,7 @@ def test_a_callback_of_ones_own_is_named_on_the_command_line_and_goes_on(train, 
 
 
 def test_a_class_that_is_no_callback_or_not_there_is_told(train, my_package, tmp_path, monkeypatch):
-    said(train("+callbacks.mine._target_=my_package.NoCallback"), "callbacks.mine", "is no callback")
+    said(train("+callbacks.mine._target_=my_package.NoCallback"), "callbacks.mine", "is not a callback")
     monkeypatch.syspath_prepend(tmp_path)
     said(train("+callbacks.mine._target_=my_package.Missing"), "callbacks.mine", "Missing")
     assert not (tmp_path / "run").exists()
@@ -81,7 +81,7 @@ def test_a_class_that_is_no_callback_or_not_there_is_told(train, my_package, tmp
 def test_a_strangers_run_folder_names_no_callback(tmp_path, line):
     (tmp_path / ".hydra").mkdir()
     (tmp_path / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([line]))
-    refused(former_overrides, tmp_path, [f"resume={tmp_path}"], parts=("which is not repeated from a file",))
+    refused(former_overrides, tmp_path, [f"resume={tmp_path}"], parts=("which is not taken from a file",))
 
 
 def test_flags_of_lightnings_need_no_plus(train, tmp_path):

@@ -254,7 +254,7 @@ def test_of_a_recorded_scene_settings_that_our_yaml_lacks_are_not_taken(tmp_path
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
     assert scene_of(file) == ["scene=mine", "scene.root='data'", "scene.of_mine=3"]
     assert "\x1b" not in caplog.text
-    assert "are not taken from a file. Give them by hand" in caplog.text
+    assert "does not take them from a file. If they are yours" in caplog.text
 
 
 def test_links_beside_a_checkpoint_do_not_lead_out(nerf, sound, tmp_path):
@@ -292,7 +292,7 @@ def bombs(folder):
     write_checkpoint(folder / "described.ckpt")
     replace_pickle(folder / "described.ckpt", b"\x80\x02" + b"]" * 17 * MEGABYTE + b".")
     return {
-        "deflated": "was made to fill the memory",
+        "deflated": "was made to fill memory",
         "bytes": "nothing from a file is executed",
         "wide": "its config describes a model of",
         "deep": "give 1 to 100 layers",

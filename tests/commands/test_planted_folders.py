@@ -176,7 +176,7 @@ IN_SWEEPS = [
 def test_a_planted_override_is_not_repeated(run, kind, line):
     leave(kind, run, "seed=0", line)
     flag = "resume=" if kind == "run" else "sweep.resume=true"
-    words = rf"{record(kind, run).name} holds .* is not repeated from a file.*type it again after {flag}"
+    words = rf"{record(kind, run).name} holds .* is not taken from a file.*type it again after {flag}"
     with pytest.raises(InputError, match=words):
         repeated(kind, run, f"resume={run}")
 
@@ -266,7 +266,7 @@ def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_p
         (tmp_path / "conf" / name).write_text(f"_target_: logging.FileHandler\nfilename: {mark}\n")
     planted = planted.replace("MARK", str(mark)).replace("FOLDER", str(tmp_path))
     leave(kind, run, planted, "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1" if kind == "sweep" else "seed=0")
-    said(nerf(*go_on_with(kind, run)), "is not repeated from a file")
+    said(nerf(*go_on_with(kind, run)), "is not taken from a file")
     assert not mark.exists()
     assert sorted(path.name for path in run.iterdir()) == [".hydra", "checkpoints", "run.json"]
     assert list((run / ".hydra").iterdir()) == [record(kind, run)]

@@ -51,10 +51,10 @@ def test_pycolmap_absent_is_said_with_the_cure(poses, photographs, tmp_path, mon
     ("settings", "fragment"),
     [
         ([], "either images=DIR (a folder of photographs) or video=FILE"),
-        (["images=a", "video=b"], "one of the two"),
-        (["images=a", "camera_model=FULL"], "camera_model=FULL does not fit: it must be SIMPLE_PINHOLE"),
+        (["images=a", "video=b"], "Give either images=DIR"),
+        (["images=a", "camera_model=FULL"], "camera_model=FULL is not valid: it must be SIMPLE_PINHOLE"),
         (["images=a", "num_features=0"], "num_features=0: give 1 or more"),
-        (["images=[1]"], "images=[1] does not fit: it must be a path"),
+        (["images=[1]"], "images=[1] is not valid: it must be a path"),
         (["images=nowhere"], "images=nowhere is not a folder that can be read (No such file or directory)"),
         (["video=nowhere.mp4"], "video=nowhere.mp4: there is no such file"),
     ],
@@ -74,7 +74,7 @@ def test_folders_without_enough_photographs_are_named(poses, tmp_path):
     with without_heic():
         refused(poses(f"images={folder}"), tmp_path, "holds a.HEIC. HEIC, as phones save it", "nerf-lightning[heic]")
     (folder / "a.HEIC").rename(folder / "a.cr2")
-    refused(poses(f"images={folder}"), tmp_path, "only other files (.cr2)", "own (photos)", "Convert raw")
+    refused(poses(f"images={folder}"), tmp_path, "only other files (.cr2)", "subfolders (photos)", "Convert raw")
     Image.new("RGB", (80, 80)).save(folder / "a.png")
     refused(poses(f"images={folder}"), tmp_path, "holds only a.png. At least 3 photographs")
 
@@ -114,7 +114,11 @@ def test_heic_is_named_or_passed_over_and_panoramas_among_other_photographs_are_
 
 @pytest.mark.parametrize(
     ("pictures", "blur", "said"),
-    [(4, 6, "are nearly all blurred, although"), (4, 0, "share too few"), (1, 0, "without depth, all from one place")],
+    [
+        (4, 6, "are nearly all blurred, although"),
+        (4, 0, "share too few"),
+        (1, 0, "without depth, all from one position"),
+    ],
 )
 def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, pictures, blur, said):
     imageio = pytest.importorskip("imageio.v3")
@@ -138,7 +142,7 @@ def test_of_photographs_of_two_places_the_larger_part_is_taken_and_the_other_nam
     result = poses(f"images={folder}", "num_features=600")
     assert result.code == 0, result.err
     assert "registered          5 of 9 photographs" in result.out
-    assert "elsewhere 3.png fit together and not to the rest: if they show another place, they belong in" in result.out
+    assert "elsewhere 3.png fit together but not with the rest: if they show another place, make a" in result.out
     left = sorted(path.name for path in (tmp_path / "found" / "sparse").iterdir())
     assert left == ["0"]
 
@@ -170,7 +174,7 @@ def test_poses_and_pictures_that_exist_are_not_overwritten(poses, photographs, t
     (tmp_path / "found" / "images").mkdir(parents=True)
     result = poses(f"images={photographs}")
     assert result.code == 2
-    assert "exists already, and is not what images= names" in result.err
+    assert "exists already, and is not the folder given with images=" in result.err
     (tmp_path / "found" / "sparse" / "0").mkdir(parents=True)
     result = poses(f"images={photographs}")
     assert result.code == 2

@@ -124,7 +124,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path, arguments, words):
 def test_a_model_of_one_level_has_no_difference_of_levels(tmp_path):
     model = RadianceModel({"fine": DenseLevel(StratifiedSampler(8), tiny_field())})
     subject, settings = Subject(model, scene_record(ball_scene()), "white"), FilmSettings(outputs=("levels",))
-    with pytest.raises(InputError, match=r"this model has one level that makes pictures.*model=nerf"):
+    with pytest.raises(InputError, match=r"this model renders one level.*model=nerf"):
         film([subject], Orbit(2), 1000, tmp_path, settings)
     assert not list(tmp_path.iterdir())
 
@@ -309,7 +309,9 @@ def test_a_frame_beyond_memory_is_refused_with_what_would_fit(monkeypatch):
     def cameras(width, height):
         return pinhole_cameras(torch.eye(4)[:3][None], 100.0, width, height)
 
-    with pytest.raises(InputError, match=r"A frame of 30000 x 15000 pixels .* takes 32\.4 GB, and 0\.8 GB") as error:
+    with pytest.raises(
+        InputError, match=r"A frame of 30000 x 15000 pixels .* takes 32\.4 GB, but only 0\.8 GB"
+    ) as error:
         require_room(cameras(30000, 15000), settings)
     width, height = (int(part.split("=")[1].split(" ")[0]) for part in str(error.value).split("path.")[1:])
     assert height == round(width / 2)

@@ -126,7 +126,7 @@ def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
 def test_what_is_no_run_is_refused(nerf, tmp_path):
     said(nerf("report", tmp_path), "no run in it")
     said(nerf("report"), "nerf report needs a run")
-    said(nerf("report", tmp_path, tmp_path / "b"), "one folder is wanted")
+    said(nerf("report", tmp_path, tmp_path / "b"), "takes one folder")
     said(nerf("report", leave_measured_run(tmp_path / "run"), "measured=twice"), "measured=twice")
 
 
@@ -195,7 +195,7 @@ def test_what_is_too_large_or_no_film_or_no_log_is_left_out(nerf, tmp_path):
     (run / "images" / "validation" / "step_0000001.png").write_bytes(b"no picture")
     result = nerf("report", run, "max_megabytes=1", "doctor=false")
     assert result.code == 0, result.err
-    assert "video.mp4 has 1,200,000 bytes, and more than 1,000,000 are not read here" in result.out
+    assert "video.mp4 has 1,200,000 bytes, more than the limit of 1,000,000" in result.out
     assert "depth.mp4 is not an mp4" in result.out
     assert "left out     A picture of the validation" in result.out
     assert "video" not in sections((run / "report.html").read_text())

@@ -78,7 +78,7 @@ def test_a_run_is_not_made_shorter_than_it_was_to_be(nerf, finished_run, tmp_pat
     quick = ("final.evaluate=false", "final.video=false")
     result = nerf("train", f"resume={run}", f"trainer.max_steps={asked}", *quick)
     assert result.code == 0, result.err
-    assert (f"goes on to step {planned}, not to {asked}" in result.err) == (asked < planned)
+    assert (f"continues to step {planned}, not {asked}" in result.err) == (asked < planned)
     note = json.loads((run / "run.json").read_text())
     assert (note["num_steps"], note["finished_at_step"], state(run)[0]) == (end, end, end)
 

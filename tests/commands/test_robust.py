@@ -69,7 +69,7 @@ def test_its_checkpoint_is_used_without_it(nerf, capture, run, tmp_path):
     ("settings", "words"),
     [
         (["loss.patch=32", "data.batch_rays=1024"], "loss.patch=32 draws squares of 32 x 32 pixels"),
-        (["data.batch_rays=40"], "data.batch_rays=40 is no multiple of that. Give data.batch_rays=32"),
+        (["data.batch_rays=40"], "data.batch_rays=40 is not a multiple of that. Give data.batch_rays=32"),
         (["loss.share=0"], "share=0: give 0.01 to 1.0"),
     ],
 )

@@ -64,7 +64,7 @@ def test_a_longer_run_takes_a_finished_one_for_unfinished(tmp_path):
 def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path):
     begin(config(tmp_path, f"paths.output_dir={tmp_path}/here")).release()
     before = json.loads((tmp_path / "here/run.json").read_text())
-    with pytest.raises(InputError, match=r"occupied by a run of another config \(seed: there 0, here 3\)"):
+    with pytest.raises(InputError, match=r"contains a run with other settings \(seed: there 0, here 3\)"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here", "seed=3", "resume=auto"), 100, None)
     with pytest.raises(InputError, match=r"already contains a run with these settings. Add resume=auto"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here"), 100, None)
@@ -84,12 +84,12 @@ def test_a_run_that_is_older_than_a_setting_goes_on_with_its_default(tmp_path, c
     here = f"paths.output_dir={tmp_path}/here"
     begin(without(config(tmp_path, here), "model.subpixels", "trainer.clip_norm")).release()
     resumed = config(tmp_path, f"resume={tmp_path}/here")
-    with pytest.raises(InputError, match=r"another config \(model.subpixels: there unknown, here 1,"):
+    with pytest.raises(InputError, match=r"other settings \(model.subpixels: there unknown, here 1,"):
         open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here", "model.subpixels=1"])
-    with pytest.raises(InputError, match=r"another config \(seed: there 0, here 3,"):
+    with pytest.raises(InputError, match=r"other settings \(seed: there 0, here 3,"):
         open_run(config(tmp_path, f"resume={tmp_path}/here", "seed=3"), 100, None)
     open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here"]).release()
-    assert "goes on with model.subpixels=1, trainer.clip_norm=None." in caplog.text
+    assert "continues with model.subpixels=1, trainer.clip_norm=None." in caplog.text
     assert begin(config(tmp_path, here, "resume=auto")).path == tmp_path / "here"
 
 
@@ -97,16 +97,16 @@ def test_a_config_that_lost_settings_since_the_run_began_is_another_one(tmp_path
     run = begin(config(tmp_path, f"paths.output_dir={tmp_path}/here", "model.subpixels=2"))
     write_config(run.path, without(config(tmp_path), "model.subpixels"), OmegaConf.create(HYDRA))
     run.release()
-    with pytest.raises(InputError, match="occupied by a run of another config"):
+    with pytest.raises(InputError, match="contains a run with other settings"):
         open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
 
 
 def test_a_setting_that_a_run_had_and_the_program_lost_is_another_config(tmp_path):
     here = f"paths.output_dir={tmp_path}/here"
     begin(config(tmp_path, here)).release()
-    with pytest.raises(InputError, match=r"another config \(model.subpixels: there 1, here unknown\)"):
+    with pytest.raises(InputError, match=r"other settings \(model.subpixels: there 1, here unknown\)"):
         open_run(without(config(tmp_path, f"resume={tmp_path}/here"), "model.subpixels"), 100, None)
-    with pytest.raises(InputError, match=r"another config \(trainer.clip_norm: there None, here unknown\)"):
+    with pytest.raises(InputError, match=r"other settings \(trainer.clip_norm: there None, here unknown\)"):
         open_run(without(config(tmp_path, f"resume={tmp_path}/here"), "trainer.clip_norm"), 100, None)
 
 
@@ -194,4 +194,4 @@ def test_a_full_disk_is_said_of_the_run_where_a_logger_does_not_name_its_file(tr
     monkeypatch.setattr("nerf_lightning.commands.train_job.fit.describe_run", full)
     result = train()
     assert result.code == 2
-    assert f"nerf: {tmp_path}/run: No space left on device. See that the place" in result.err.splitlines()[-1]
+    assert f"nerf: {tmp_path}/run: No space left on device. Check that the folder" in result.err.splitlines()[-1]

@@ -136,10 +136,10 @@ def test_other_pictures_are_told_by_the_settings_that_chose_them(table, tmp_path
             tmp_path / "runs" / name, overrides=overrides, protocol={"split_hash": name * 16}, origin={"config": name}
         )
     result, _ = table("models=fast")
-    said(result, "runs/a", "runs/b", "(other pictures, of scene.num_test=8 and scene.num_test=16)")
+    said(result, "runs/a", "runs/b", "(different views: scene.num_test=8 and scene.num_test=16)")
     assert "split_hash" not in result.err
     text = table("force=true")[0].out
-    assert "other pictures, of scene.num_test=8 and its default" in text
+    assert "different views: scene.num_test=8 and its default" in text
     assert "split_hash" not in text
 
 
@@ -154,7 +154,7 @@ def test_what_makes_the_pictures_differ_is_told_alone(table, tmp_path):
 def test_pictures_that_no_setting_tells_apart_are_said_to_be_other_files(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a")
     leave_measured_run(tmp_path / "runs" / "b", protocol={"split_hash": "f" * 16}, origin={"config": "b"})
-    said(table()[0], "(other pictures, by the same settings: the capture was changed in between)")
+    said(table()[0], "(different views, although the settings are the same: the capture has changed)")
 
 
 def test_a_class_of_ones_own_has_the_column_of_its_group(table, tmp_path):
@@ -227,7 +227,7 @@ def test_rows_are_chosen_and_sorted(table, tmp_path):
     assert [row["model"] for row in ours(table("sort=minutes")[1])] == ["fast_small", "fast", "nerf"]
     assert [row["model"] for row in ours(table("models=fast*")[1])] == ["fast", "fast_small"]
     assert [row["model"] for row in ours(table("models=[nerf,fast_*]")[1])] == ["nerf", "fast_small"]
-    said(table("models=gnt")[0], "No run fits models=[gnt].", "fast, fast_small, nerf")
+    said(table("models=gnt")[0], "No run matches models=[gnt].", "fast, fast_small, nerf")
     said(table("sort=speed")[0], "sort=speed", "frames_per_second")
 
 

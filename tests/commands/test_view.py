@@ -132,7 +132,7 @@ def test_a_missing_checkpoint_and_a_port_that_is_none_are_said(finished_run, ner
     arguments = [f"ckpt={checkpoint}", f"paths.output_dir={tmp_path}", "photographs=false"]
     said(nerf("view", *arguments, "port=0"), "port=0: give a number from 1 to 65535")
     said(nerf("view", *arguments, "host=192.0.2.1"), "host=192.0.2.1: this machine cannot listen there")
-    said(nerf("view", *arguments, "viewer.hosts=['a b']"), "viewer.hosts: 'a b' is no name of a machine")
+    said(nerf("view", *arguments, "viewer.hosts=['a b']"), "viewer.hosts: 'a b' is not the name of a machine")
 
 
 @pytest.fixture

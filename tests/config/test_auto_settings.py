@@ -108,8 +108,8 @@ def seen_sharply(photographs=30):
     ("photographs", "overrides", "grid", "said"),
     [
         (30, (), (2048, 19), "as small as the pixels"),
-        (30, ("budget.seconds=60",), (1024, 18), "twice as wide as the pixels for so short a training"),
-        (29, (), (1024, 18), "twice as wide as the pixels for so few photographs without known distances"),
+        (30, ("budget.seconds=60",), (1024, 18), "twice as wide as the pixels because the run is short"),
+        (29, (), (1024, 18), "twice as wide as the pixels because there are few photographs and no known distances"),
     ],
 )
 def test_without_depths_pixels_are_as_wide_as_at_the_middle_of_the_scene(caplog, photographs, overrides, grid, said):
@@ -209,7 +209,7 @@ def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(
 def test_a_new_run_knows_of_no_former_one_and_what_is_neither_a_switch_nor_auto_is_refused(tmp_path):
     for overrides in ([], [f"paths.output_dir={tmp_path}/new"], ["resume=auto"]):
         assert former_config(compose_config("train", overrides)[0], job_folder=None) is None
-    with pytest.raises(InputError, match="doctor=maybe does not fit"):
+    with pytest.raises(InputError, match="doctor=maybe is not valid"):
         chosen_for(PHOTOGRAPHS, "doctor=maybe")
 
 

@@ -157,5 +157,5 @@ def test_squares_that_fit_no_picture_or_no_batch_are_refused_with_a_cure_and_the
     assert int(pixels.x.max()) < 9
     with pytest.raises(InputError, match=r"loss\.patch=16 .* ball_0 of ball has 12 x 12"):
         RayDataModule(ball_scene(), Progress(), 0, batch_rays=256, patch=16)
-    with pytest.raises(InputError, match=r"data\.batch_rays=100 is no multiple .* data\.batch_rays=96"):
+    with pytest.raises(InputError, match=r"data\.batch_rays=100 is not a multiple .* data\.batch_rays=96"):
         RayDataModule(ball_scene(), Progress(), 0, batch_rays=100, patch=4)

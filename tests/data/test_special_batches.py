@@ -84,7 +84,7 @@ def test_the_crop_comes_first_and_pictures_smaller_than_their_share_of_rays_come
     [
         ({"views_per_step": 3, "batch_rays": 32}, "divides the number of rays"),
         ({"views_per_step": 0}, "divides the number of rays"),
-        ({"views_per_step": 2, "sample_budget": 1000}, "neither with data.sample_budget"),
+        ({"views_per_step": 2, "sample_budget": 1000}, "cannot be combined with data.sample_budget"),
         ({"views_per_step": 2, "patch": 4}, "loss.patch"),
     ],
 )

@@ -226,7 +226,7 @@ def cropped(center):
         ("c2w", lambda c2w: rolled(c2w, 1), "upright", "look", "on their side"),
         ("c2w", lambda c2w: rolled(c2w, 2), "upright", "look", "on their head"),
         ("c2w", lambda c2w: c2w * torch.tensor([1.0, 1, 1, 0]), "rotations", "wrong", "are at the same position"),
-        ("c2w", lambda c2w: c2w * torch.tensor([-1.0, 1, 1, 1]), "rotations", "wrong", "no rotations"),
+        ("c2w", lambda c2w: c2w * torch.tensor([-1.0, 1, 1, 1]), "rotations", "wrong", "not rotations"),
     ],
 )
 def test_cameras_that_no_photographer_has_are_named(attribute, change, name, verdict, says):
@@ -297,7 +297,7 @@ def test_what_is_wrong_stops_the_training_with_the_cure_and_what_else_is_wrong(v
         Check("focal length", "wrong", "twice too long", "Halve it."),
     ]
     with pytest.raises(
-        InputError, match=r"convention: every camera looks away\. Turn the poses\. Wrong, too: focal"
+        InputError, match=r"convention: every camera looks away\. Turn the poses\. Also wrong: focal"
     ) as stop:
         gate.require_sound(ball_scene())
     assert "doctor=off trains anyway" in str(stop.value)

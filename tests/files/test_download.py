@@ -105,7 +105,7 @@ def test_unreachable_port(monkeypatch, target):
 
 @pytest.mark.parametrize("url", ["http://example.invalid/a", "ftp://example.invalid/a", "file:///etc/hosts", "a"])
 def test_only_https_is_trusted_without_a_checksum_and_http_with_one(target, url):
-    refused(url, target, "is not an https address, and without a checksum nothing else is trusted", sha256=None)
+    refused(url, target, "is not an https address, which is needed without a checksum", sha256=None)
     if not url.startswith("http"):
         refused(url, target, "is not an https address")
 

@@ -118,7 +118,7 @@ def test_a_channel_is_trained_rendered_filmed_and_exported_without_being_listed(
 
 
 def test_a_weighted_sum_refuses_what_does_not_fit():
-    with pytest.raises(ValueError, match="weights names ssim, which is no loss: there are mse"):
+    with pytest.raises(ValueError, match="weights names ssim, which is not a loss: there are mse"):
         WeightedSum({"mse": MeanSquaredError()}, {"ssim": 1.0})
     with pytest.raises(ValueError, match=r"squares of \[4, 8\] pixels"):
         WeightedSum({"a": DSSIM(4), "b": DSSIM(8)})

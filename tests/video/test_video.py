@@ -119,7 +119,7 @@ def test_no_ffmpeg_says_how_to_get_it(tmp_path, monkeypatch):
         raise RuntimeError("No ffmpeg exe could be found")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none)
-    with pytest.raises(InputError, match=r"there is none.*pip install imageio-ffmpeg.*PNG frames"):
+    with pytest.raises(InputError, match=r"which is not installed.*pip install imageio-ffmpeg.*PNG frames"):
         write_video(tmp_path / "a.mp4", plain(8, 8), fps=10)
     assert os.listdir(tmp_path) == []
 

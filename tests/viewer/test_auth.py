@@ -82,7 +82,7 @@ def test_each_start_has_a_token_of_its_own(page, tmp_path):
 
 @pytest.mark.parametrize("name", ["http://castle", "castle example", "*", "a:b", ""])
 def test_a_host_that_is_none_is_named(tmp_path, name):
-    with pytest.raises(InputError, match="give names of machines like castle"), served(tmp_path, hosts=[name]):
+    with pytest.raises(InputError, match="give names such as castle"), served(tmp_path, hosts=[name]):
         pass
 
 

@@ -117,7 +117,7 @@ def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) ->
     chosen = build(config.callbacks)
     for name, callback in chosen.items():
         if not isinstance(callback, Callback):
-            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
+            raise InputError(f"callbacks.{name}={callback} is not a callback. To remove one, add ~callbacks.{name}.")
     callbacks: list[Callback] = [signals, clock, FolderGuard(), *chosen.values()]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))

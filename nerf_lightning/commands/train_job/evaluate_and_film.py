@@ -117,7 +117,7 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
     if far:
         names = [f"{scene.view_names[trained[place]]} ({float(motion[place]):.1%})" for place in far[:MOST_NAMED]]
         more = f" and {len(far) - MOST_NAMED} more" if len(far) > MOST_NAMED else ""
-        lines.append(f"             far more than that, so look at their poses: {', '.join(names)}{more}")
+        lines.append(f"             far more than that; check their poses: {', '.join(names)}{more}")
     return replace(scene, cameras=learnt, refined=True), lines
 
 
@@ -126,10 +126,11 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
+    background = "no" if protocol["background"] == "none" else protocol["background"]
     fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
-        f"({metrics['num_images']} views, {protocol['background']} background)",
+        f"({metrics['num_images']} views, {background} background)",
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]

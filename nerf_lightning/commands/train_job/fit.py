@@ -46,9 +46,9 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
             raise
         trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
         raise InputError(
-            f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
-            f"{_what_is_left(folder)} If it fails again, nerf selftest tells whether the GPU computes right, and "
-            "trainer=cpu does without it."
+            "The GPU has failed after "
+            f"step {trainer.global_step}: {' '.join(str(error).split())[:200]}. {_what_is_left(folder)} If it fails "
+            "again, nerf selftest checks the GPU's results, and trainer=cpu does not use it."
         ) from error
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
@@ -61,8 +61,8 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
 
 def _what_is_left(folder: HeldFolder) -> str:
     if not any((folder.path / "checkpoints").glob("*.ckpt")):
-        return "Nothing was saved yet: begin anew."
-    return f"Go on from the last checkpoint with: {resume_command(folder.path)}."
+        return "Nothing was saved yet: start again."
+    return f"Resume from the last checkpoint with: {resume_command(folder.path)}."
 
 
 def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
@@ -70,8 +70,8 @@ def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
     former = folder.former
     if former is not None and job.num_steps < former.num_steps:
         log.warning(
-            "This run was to take %d steps, and its learning rate follows that length: it goes on to step %d, not to "
-            "%d. For a shorter run begin a new one.",
+            "This run was planned for %d steps, and its learning rate follows that length: it continues to step %d, "
+            "not %d. For a shorter run, start a new one.",
             former.num_steps,
             former.num_steps,
             job.num_steps,
@@ -119,7 +119,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         "steps replayed" if step.records else "whole batches" if tile is None else f"tiles of {tile} points",
     )
     if folder.former is None and job.config.resume == "auto":
-        log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new one")
+        log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")
     own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
     if own:
         log.info(

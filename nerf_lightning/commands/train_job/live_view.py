@@ -72,7 +72,7 @@ class LiveView(Callback):
         require_address(host, port)
         names_of(hosts)
         if not 0 < share < 1:
-            raise InputError(f"viewer.live_view.share={share}: give a part of the time between 0 and 1, like 0.15.")
+            raise InputError(f"viewer.live_view.share={share}: give a share of the time between 0 and 1, such as 0.15.")
         self.host, self.port, self.hosts = host, port, hosts
         self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
         self.page: Page | None = None
@@ -108,7 +108,7 @@ class LiveView(Callback):
         """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
         if ranks.largest(float(self.switch.wants_stop)):
             trainer.should_stop = True
-            self._say(f"the training was stopped in the page at step {trainer.global_step}")
+            self._say(f"training was stopped from the page at step {trainer.global_step}")
         if self.page is None:
             return
         self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.step.num_steps
@@ -136,7 +136,7 @@ class LiveView(Callback):
 
     def _pause(self, trainer: Trainer, system: Any, page: Page) -> None:
         """Render for those who look on, and take no step, until somebody lets the training go on."""
-        self._say(f"the training pauses at step {trainer.global_step}: somebody has asked for it in the page")
+        self._say(f"training is paused at step {trainer.global_step}, as requested from the page")
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         signals = [each for each in callbacks if isinstance(each, StopSignals)]
         share, renderer = self.share, page.queue.renderer
@@ -156,7 +156,7 @@ class LiveView(Callback):
             if isinstance(callback, Clocked):
                 callback.leave_out(seconds)
         self.last = time.perf_counter()
-        self._say(f"the training goes on, after a pause of {spoken(seconds)}")
+        self._say(f"training continues after a pause of {spoken(seconds)}")
 
     def _say(self, text: str) -> None:
         if self.page is not None and text != self.said:

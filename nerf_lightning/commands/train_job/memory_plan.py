@@ -79,8 +79,8 @@ class MemoryPlan:
         largest = max(curable, key=lambda row: row.num_bytes)
         needed, free, most = (f"{size / GIGABYTE:.1f} GB" for size in (self.total, self.free, largest.num_bytes))
         return (
-            f"The run needs about {needed} of memory, and {free} are free: it may be stopped by the system. "
-            f"Most of it is {largest.what} ({most}): {largest.cure}."
+            f"The run needs about {needed} of memory, but only {free} are free, so the system may stop it. Most of it "
+            f"is {largest.what} ({most}): {largest.cure}."
         )
 
 

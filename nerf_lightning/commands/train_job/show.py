@@ -57,7 +57,7 @@ def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
     """Return the last line: the page, what came out of the photographs, and what would improve it most."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total = used + len(job.scene.left_out)
-    quality = "" if psnr is None else f"{psnr:.1f} dB on photographs held out, "
+    quality = "" if psnr is None else f"{psnr:.1f} dB on held-out photographs, "
     longer = "train longer" if seconds is None else f"budget.seconds={2 * seconds:g} trains twice as long"
     cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
     return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
@@ -77,7 +77,7 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
     except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         log.warning(
-            "The run is whole, but final.%s failed: %s nerf export ckpt=%s what=%s writes it later.",
+            "The run is complete, but final.%s failed: %s nerf export ckpt=%s what=%s writes it later.",
             name,
             reason if reason.endswith(".") else f"{reason}.",
             folder,

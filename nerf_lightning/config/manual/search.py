@@ -1,4 +1,4 @@
-"""What `nerf help WORDS` finds where no setting, group or option has that name: symptoms, options and settings."""
+"""What `nerf help WORDS` finds where nothing has that name: symptoms, commands, options and settings."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,13 +9,14 @@ from nerf_lightning.config.manual.pages import brief, row
 from nerf_lightning.files.folders import conf_folder
 
 MOST = 20
-"""Options and settings that are listed."""
+"""Commands, options and settings that are listed."""
 
 
 def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str:
     """Return what all the words, or their beginnings, stand in; empty if there is nothing."""
     begun = [re.compile(rf"\b{re.escape(word[: max(4, len(word) - 2)])}", re.IGNORECASE) for word in words]
-    texts = dict[str, str]()
+    # Their help begins with `nerf NAME: what it does.`
+    texts = {f"nerf {each.name}": each.template.partition(": ")[2].partition("\n\n")[0] for each in commands}
     for command in commands:
         options = (option for group in command.options.values() for option in group)
         own = (each for each in command.settings if each.text and each.is_own)

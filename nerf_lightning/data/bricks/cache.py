@@ -47,7 +47,7 @@ def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
         lock = FileLock(path.with_suffix(".lock"))
         lock.acquire()
     except (OSError, InputError) as error:
-        logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered anew.", path.parent, error)
+        logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered again.", path.parent, error)
         return make()
     try:
         return _load(path, pixels) or _save(path, make())
@@ -68,7 +68,7 @@ def _load(path: Path, pixels: int) -> Rendered | None:
                 raise ValueError(f"{name} is {array.shape} of {array.dtype}")
         return Rendered(**arrays)
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile, InputError) as error:
-        logger.warning("The cached bricks scene %s is damaged (%s): it is rendered anew.", path, error)
+        logger.warning("The cached bricks scene %s is damaged (%s): it is rendered again.", path, error)
         return None
 
 

@@ -108,11 +108,11 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
     (width, height), (x, y), center = view.size, view.focal, view.center
     numbers = torch.tensor([*view.focal, *center, *view.size, *view.lens], dtype=torch.float64)
     if not bool(torch.isfinite(numbers).all() and torch.isfinite(view.c2w).all()):
-        return "has a pose or intrinsics with NaN or infinity. Remove it, or estimate the poses anew."
+        return "has a pose or intrinsics with NaN or infinity. Remove it, or estimate the poses again."
     if max(x, y) > FARTHEST or float(view.c2w[:, 3].abs().max()) > FARTHEST:
         return (
-            f"has a focal length or a center beyond {FARTHEST:g}, where no digit is left that a picture could show. "
-            "Export the cameras again, in units of about the scene's size."
+            f"has a focal length or a center beyond {FARTHEST:g}, where numbers become too coarse. Export the cameras "
+            "again, in units of about the scene's size."
         )
     if not min(x, y) >= LEAST_FOCAL or min(width, height) < 1:
         return (
@@ -123,12 +123,12 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
         return (
             f"has its principal point at {center[0]:g}, {center[1]:g}, outside of its {width:g} x {height:g} pixels. "
             "The intrinsics belong to pictures of another size, or are in other units; they must be in pixels of the "
-            "width and height beside them."
+            "given width and height."
         )
     if max(center) <= 1 and min(width, height) > SMALL:
         return (
             f"has its principal point at {center[0]:g}, {center[1]:g} of {width:g} x {height:g} pixels, which looks "
-            "like a share of the picture: it must be in pixels. Export the intrinsics again."
+            "like a fraction of the picture: it must be in pixels. Export the intrinsics again."
         )
     if not bool(is_rigid(view.c2w)):
         return (
@@ -136,7 +136,7 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
             "mirrors or shears along some axis). Export it again."
         )
     if lens_model in ("pinhole", "radial_tangential") and (reason := impossible_lens(view.size, view.focal)):
-        return f"has {reason}. The focal length must be in pixels of the width and height beside it, not a share."
+        return f"has {reason}. The focal length must be in pixels of the given width and height, not a fraction."
     return None
 
 
@@ -182,8 +182,8 @@ def check_metres(metres_per_unit: float | None) -> None:
     """Refuse a unit of no length, or beyond all digits."""
     if metres_per_unit is not None and not LEAST_UNIT <= metres_per_unit <= LARGEST_UNIT:
         raise InputError(
-            f"scene.metres_per_unit={metres_per_unit}: give how many meters one unit of the capture is long, such as "
-            "0.01 for centimeters, or null where that is unknown."
+            f"scene.metres_per_unit={metres_per_unit}: give the length of one unit of the capture in meters, such as "
+            "0.01 for centimeters, or null if it is unknown."
         )
 
 
@@ -211,7 +211,7 @@ def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
         raise InputError(f"{where} must be a 4 x 4 matrix, but it is {shape}. Export the camera poses again.")
     if not bool(torch.isfinite(pose).all()):
         raise InputError(
-            f"{where} holds NaN or infinity: this view has no pose. Remove it, or estimate the poses anew."
+            f"{where} holds NaN or infinity: this view has no pose. Remove it, or estimate the poses again."
         )
     last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
     if len(pose) == 4 and not _alike(pose[3], last) and _alike(pose[:, 3], last):

@@ -144,19 +144,19 @@ def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Cap
     if not float(reach) <= FARTHEST:  # NaN, too
         raise InputError(
             f"{capture.source}: the content (its depths, its sparse points or its box) would reach {float(reach):g} "
-            "times the cameras' distance from the middle, which is a mistake of the reconstruction. Find and remove "
-            "what lies so far away, or export the capture again."
+            "times the cameras' distance from the middle, which must be an error of the reconstruction. Remove what "
+            "lies so far away, or export the capture again."
         )
     if not bool((extent.aabb[0] < extent.aabb[1]).all() and (extent.near < extent.far).all()):
         raise InputError(
-            f"{capture.source}: all of the content lies in one plane or at one distance, so there is no room for a "
-            "scene. Add scene.space=contracted, or remove what describes the content (sparse points, aabb_scale)."
+            f"{capture.source}: all of the content lies in one plane or at one distance, so the scene has no volume. "
+            "Add scene.space=contracted, or remove what describes the content (sparse points, aabb_scale)."
         )
     unit = unit_of(to_user.double())
     if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
         raise InputError(
-            f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "
-            "is so small or so large. Fix applied_scale and applied_transform, or the cameras' distances."
+            f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, which is "
+            "implausible. Fix applied_scale and applied_transform, or the cameras' distances."
         )
 
 
@@ -234,7 +234,7 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far:
     # LLFF's frame: the average camera looks along -z; the unit is such that the near plane lies at z = -1.
     if far is not None:
         raise InputError(
-            f"scene.far={far:g} cannot be kept with scene.space=ndc, which reaches to infinity. Leave it out, or use "
+            f"scene.far={far:g} cannot be used with scene.space=ndc, which reaches to infinity. Leave it out, or use "
             "scene.space=contracted or bounded."
         )
     mean = average_pose(cameras.c2w)

@@ -95,9 +95,9 @@ def find_pictures(
     ]
     if len(same) > 1:
         raise InputError(
-            f"{source} names pictures such as {names[0]}, which fit files of {listed(rule.folder for rule in same)} "
-            f"alike. Move all but one of these folders out of {root} (or say which is meant with scene.images=FOLDER, "
-            "which scene=colmap takes)."
+            f"{source} names pictures such as {names[0]}, which match files of {listed(rule.folder for rule in same)} "
+            f"equally well. Move all but one of these folders out of {root} (or choose one with scene=colmap "
+            "scene.images=FOLDER)."
         )
     found = rules[best]
     name, path = next(iter(found.items()))
@@ -105,7 +105,7 @@ def find_pictures(
         usual = _rank(best, folder, root)[2] < len(PICTURE_FOLDERS)
         log.log(
             logging.INFO if usual else logging.WARNING,
-            "%s: %d of %d pictures are found by another name, such as %s for %s",
+            "%s: %d of %d pictures are found under another name, such as %s for %s",
             *(source, len(found), len(names), path.relative_to(root) if path.is_relative_to(root) else path, name),
         )
     return {name: path for name in names if (path := exact.get(name) or found.get(name))}
@@ -141,7 +141,7 @@ def pictures_by_stem(folder: Path) -> dict[str, Path]:
         if found.setdefault(path.stem, path) is not path:
             twins.append(path.relative_to(folder).as_posix())
     if twins:
-        log.warning("%s: %d pictures are passed over, twins of others: %s", folder, len(twins), listed(twins, 3))
+        log.warning("%s: %d pictures are left out as duplicates of others: %s", folder, len(twins), listed(twins, 3))
     return dict(sorted(found.items()))
 
 

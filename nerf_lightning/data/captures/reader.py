@@ -158,7 +158,7 @@ class CaptureReader(Reader):
         found = located(folder, lambda path: path if self.found_in(path) else None)
         require_one(found, self.root)
         if found and found[0] != folder:
-            log.info("%s holds no capture of scene=%s; %s, which does, is read", self.root, self.name, found[0])
+            log.info("%s contains no capture for scene=%s; reading %s instead", self.root, self.name, found[0])
         return found[0] if found else folder
 
     def named_folder(self) -> Path:
@@ -184,9 +184,9 @@ class CaptureReader(Reader):
             masks = find_pictures(names, folder, folder, capture.source, beside=photographs)
             if not masks:
                 raise InputError(
-                    f"scene.masks={self.masks} holds no mask for any photograph of {capture.source}: {folder} holds "
-                    f"{contents(folder)}. A mask is called like its photograph ({names[0]}, with .png added, or with "
-                    ".png or _mask.png for its ending)."
+                    f"scene.masks={self.masks} holds no mask for any photograph of {capture.source}: {folder} "
+                    f"holds {contents(folder)}. A mask is named after its photograph ({names[0]}, with .png added, or "
+                    "with .png or _mask.png instead of its extension)."
                 )
         views = tuple(
             replace(view, photograph=replace(view.photograph, mask=masks.get(view.name, view.photograph.mask)))
@@ -195,8 +195,8 @@ class CaptureReader(Reader):
         whole = [view.name for view in views if view.photograph.mask is None]
         if len(whole) == len(views) and self.masks_keep == "black":
             raise InputError(
-                f"scene.masks_keep=black, and no photograph of {capture.source} has a mask. Say where they are with "
-                "scene.masks=FOLDER, or leave masks_keep out."
+                f"scene.masks_keep=black, but no photograph of {capture.source} has a mask. Name their folder with "
+                "scene.masks=FOLDER, or leave out masks_keep."
             )
         if whole and len(whole) < len(views):
             log.warning(
@@ -227,7 +227,7 @@ class CaptureReader(Reader):
         if self.downscale != "auto":
             check_step("downscale", self.downscale)
         if self.hold_every < 2:
-            raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
+            raise InputError(f"scene.hold_every={self.hold_every} would leave no training views: give 2 or more.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         check_metres(self.metres_per_unit)
         background_for(self.background, None, "black")
@@ -254,13 +254,13 @@ class CaptureReader(Reader):
         splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
         if splits["train"] and not (splits["val"] or splits["test"]):
             log.warning(
-                "%s names no view to judge by that is there: every %dth is held out", capture.source, self.hold_every
+                "%s lists no held-out view that exists: every %dth view is held out", capture.source, self.hold_every
             )
             train, held = every_kth(splits["train"], self.hold_every)
             return {"train": train, "val": held, "test": held}
         if not splits["train"]:
             raise InputError(
-                f"{capture.source} names no view to learn from that is there. Fix its lists, or remove them so that "
+                f"{capture.source} lists no training view that exists. Fix its lists, or remove them so that "
                 f"every {self.hold_every}th view is held out."
             )
         held = splits["val"] or splits["test"]
@@ -343,8 +343,8 @@ def as_calibrated(capture: Capture) -> Capture:
     if turned:
         as_shown = sum(views[number].photograph.upright for number in turned)
         log.info(
-            "%s: %d of %d photographs are to be shown turned (EXIF orientation); %d are read so, since only then their "
-            "sizes fit their cameras, and the others as they are stored",
+            "%s: %d of %d photographs are rotated by EXIF; the rotation is applied to %d, whose sizes match their "
+            "cameras only then, and not to the others",
             *(capture.source, len(turned), len(kept), as_shown),
         )
     return replace(capture, views=tuple(views)).some(kept)
@@ -359,9 +359,9 @@ def require_fit(view: View, width: int, height: int) -> None:
     """Refuse a picture that is no shrunk copy of what its camera describes."""
     if not _fits(view, width, height):
         raise InputError(
-            f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for "
-            f"{view.size[0]:g} x {view.size[1]:g}: the sides differ by other factors ({width / view.size[0]:.3f} and "
-            f"{height / view.size[1]:.3f}). The picture was cropped, turned or stretched after the poses were "
+            f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for {view.size[0]:g} "
+            f"x {view.size[1]:g}: the sides differ by different factors ({width / view.size[0]:.3f} "
+            f"and {height / view.size[1]:.3f}). The picture was cropped, rotated or stretched after the poses were "
             "estimated; use the original one."
         )
 
@@ -378,8 +378,9 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
     sizes = [downscaled_size(width, height, downscale) for width, height in files]
     if sizes != list(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)):
         raise InputError(
-            f"The pixels that were kept of {capture.source} have other sizes than its photographs: somebody else wrote "
-            "them. Remove them from scene.cache_dir (else ~/.cache/nerf_lightning), and the photographs are read anew."
+            f"The cached pixels of {capture.source} have other sizes than its photographs, so something else wrote "
+            "them. Remove them from scene.cache_dir (by default ~/.cache/nerf_lightning), and the photographs will be "
+            "read again."
         )
 
     def column(name: str) -> Tensor:

@@ -59,8 +59,7 @@ def apart(
         return tuple(train)
     if set(train) == set(test):
         log.warning(
-            "%s: the views to learn from are those to judge by, so scores will say how well they are remembered, and "
-            "nothing of new views.",
+            "%s: the training views are also the test views, so scores will say nothing about new views.",
             source,
         )
         return tuple(train)
@@ -68,12 +67,12 @@ def apart(
     left = len(train) - len(both)
     if left < len(both):
         raise InputError(
-            f"{source}: {len(both)} of {len(train)} views to learn from are to be judged by, too ({names}), and "
-            f"without them {left} would be left. Take them out of the lists to judge by (val, test) if they are "
-            "to be learned from, or out of the list to learn from."
+            f"{source}: {len(both)} of {len(train)} training views are also held out ({names}), and without "
+            f"them {left} would be left. Remove them from the val and test lists to train on them, or from the "
+            "training list."
         )
     log.warning(
-        "%s: %d of %d views are listed both to learn from and to judge by, and are not learned from: %s",
+        "%s: %d of %d views are listed both for training and as held out, and are not trained on: %s",
         source,
         len(both),
         len(train),
@@ -86,8 +85,7 @@ def _both(train: tuple[int, ...], held: tuple[int, ...]) -> tuple[tuple[int, ...
     """Refuse an empty half."""
     if not train or not held:
         raise InputError(
-            f"Holding out views from {len(train) + len(held)} leaves {len(train)} to learn from and "
-            f"{len(held)} to judge by, but each needs at least one. Add views, or hold out "
-            "another share of them."
+            f"Holding out views from {len(train) + len(held)} leaves {len(train)} for training and {len(held)} for "
+            "evaluation, but both need at least one. Add views, or hold out a different share."
         )
     return train, held

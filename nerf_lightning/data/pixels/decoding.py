@@ -97,8 +97,8 @@ def read_photographs(
     store = stored(base, contents, partial(_write, list(photographs), downscale, contents, label))
     if len(store.width) != len(photographs):
         raise InputError(
-            f"{base}.pixels holds {len(store.width)} photographs where {len(photographs)} belong: somebody else wrote "
-            f"it. Remove {base}.json, and the photographs are read anew."
+            f"{base}.pixels holds {len(store.width)} photographs instead of {len(photographs)}, so something else "
+            f"wrote it. Remove {base}.json, and the photographs will be read again."
         )
     return store
 
@@ -206,9 +206,9 @@ def _mask(
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""
         white = photograph.mask_keeps == "white"
         raise InputError(
-            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is "
-            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Fix the "
-            f"mask, leave this view out, or turn all masks round with scene.masks_keep={'black' if white else 'white'}."
+            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what "
+            f"is {'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Fix the "
+            f"mask, leave this view out, or invert all masks with scene.masks_keep={'black' if white else 'white'}."
         )
     return kept
 
@@ -216,7 +216,7 @@ def _mask(
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:
     """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbor."""
     if (pixels.shape[1], pixels.shape[0]) != size:
-        raise InputError(f"{path} changed while it was read. Start again when it is no longer written to.")
+        raise InputError(f"{path} changed while it was being read. Try again when it is complete.")
 
 
 def photograph_hashes(pixels: PixelStore) -> Int[Tensor, "views"]:

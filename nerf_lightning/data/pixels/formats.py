@@ -12,15 +12,15 @@ HEIC_KINDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"m
 HEIC_CURE = (
     "HEIC, as phones save it, needs a decoder: pip install 'nerf-lightning[heic]'. Or convert all of them to JPEG "
     "(`magick mogrify -format jpg *.heic`, or a phone's own export as JPEG, its setting 'most compatible'), and give "
-    "the folder of these."
+    "their folder."
 )
 RAW_CURE = (
     "RAW is not read. Develop all of them with the same settings to JPEG or 16-bit TIFF (darktable, RawTherapee, or "
-    "`magick mogrify -format jpg`), and give the folder of these."
+    "`magick mogrify -format jpg`), and give their folder."
 )
 EXR_CURE = (
-    "OpenEXR holds linear light, which is not read. Convert all of them with the same exposure to PNG "
-    "(`magick mogrify -colorspace sRGB -format png *.exr`), and give the folder of these."
+    "OpenEXR holds linear light, which is not read. Convert all of them with the same exposure to PNG (`magick mogrify "
+    "-colorspace sRGB -format png *.exr`), and give their folder."
 )
 UNREAD = dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), RAW_CURE) | {".exr": EXR_CURE}
 """Endings, and what to do about such files. Most RAW files are TIFFs to PIL, which would read a small preview."""

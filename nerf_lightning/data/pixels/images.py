@@ -147,7 +147,7 @@ def _is_deep(image: Image.Image) -> bool:
 
 @cache
 def _say_reduced(folder: Path) -> None:
-    log.info("%s: pictures of 16 bits per channel are read with 8, the upper ones", folder)
+    log.info("%s: pictures with 16 bits per channel are read with the upper 8", folder)
 
 
 def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
@@ -158,7 +158,7 @@ def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
     """
     with _opened(path) as image:
         if image.mode not in GREY_16:
-            raise InputError(f"The depth map {path} is no gray picture of 16 bits. Save it as a 16-bit PNG.")
+            raise InputError(f"The depth map {path} is not a 16-bit grayscale picture. Save it as a 16-bit PNG.")
         try:
             return np.asarray(image).astype(np.uint16)
         except DECODER_ERRORS as error:
@@ -285,8 +285,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
                 image = opened.enter_context(Image.open(file, formats=decoders()))
         except Image.DecompressionBombError as error:
             raise InputError(
-                f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can "
-                f"announce any number. Shrink it first, or, if you trust it, add budgets.megapixels={2 * most}."
+                f"{path} claims more than {most} megapixels; more is not safe to decode, because a small file can "
+                f"claim any number. Shrink it first, or, if you trust it, add budgets.megapixels={2 * most}."
             ) from error
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
@@ -304,14 +304,13 @@ def _check_jpeg(image: Image.Image, file: BufferedReader, path: Path) -> None:
     # It has a bit at least for each block of them.
     if 8 * size * JPEG_BLOCK < width * height:
         raise InputError(
-            f"{path} announces {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. "
-            f"{CURE}"
+            f"{path} claims {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. {CURE}"
         )
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         scans = jpeg_scans(content)
     if scans > MOST_SCANS:
         raise InputError(
-            f"{path} draws its pixels in {scans} passes, where sound files have {SOUND_SCANS} at most: it would take "
+            f"{path} draws its pixels in {scans} passes, but intact files have at most {SOUND_SCANS}: it would take "
             f"hours to decode. {CURE}"
         )
 
@@ -333,18 +332,18 @@ def _check_plain(image: Image.Image, path: Path) -> None:
     frames = _num_frames(image, path)
     if frames > 1:
         raise InputError(
-            f"{path} holds {frames} pictures (an animation, or pages), and which of them was meant is not known. "
-            "Save each as a file of its own, for example with ffmpeg or `magick`, and name the one that belongs here."
+            f"{path} holds {frames} pictures (an animation, or pages), and it is unclear which one is meant. Save each "
+            "as a file of its own, for example with ffmpeg or `magick`, and name the one that belongs here."
         )
     if image.mode == "CMYK":
         raise InputError(
-            f"{path} has CMYK colors, which are for printing, and no one reading as RGB. Convert it with its color "
-            f"profile, for example `magick {path.name} -colorspace sRGB {path.stem}.png`."
+            f"{path} has CMYK colors, which are for printing and can be read as RGB in several ways. Convert it with "
+            f"its color profile, for example `magick {path.name} -colorspace sRGB {path.stem}.png`."
         )
     if image.mode not in MODES + GREY_16:
         raise InputError(
-            f"{path} has the pixel mode {image.mode!r}, which has no plain reading as 8-bit color. "
-            "Save it as an 8-bit RGB or RGBA PNG."
+            f"{path} has the pixel mode {image.mode!r}, which cannot be read unambiguously as 8-bit color. Save it as "
+            "an 8-bit RGB or RGBA PNG."
         )
 
 

@@ -102,8 +102,8 @@ def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> 
                 header = _sound_header(base, contents) or _make(base, make)
     except OSError as error:
         raise InputError(
-            f"The pixels of the photographs cannot be kept in {base.parent}: {error.strerror or error}. Make room "
-            "or name another folder with NERF_LIGHTNING_CACHE or scene.cache_dir."
+            f"The pixels of the photographs cannot be cached in {base.parent}: {error.strerror or error}. Make room or "
+            "name another folder with NERF_LIGHTNING_CACHE or scene.cache_dir."
         ) from error
     return _mapped(base.with_suffix(".pixels"), header)
 
@@ -136,7 +136,7 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
     finally:
         part.unlink(missing_ok=True)
         note.unlink(missing_ok=True)
-    log.info("Kept %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
+    log.info("Cached %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
     return header
 
 
@@ -153,13 +153,13 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, RecursionError, InputError) as error:
-        log.warning("%s is not used (%s); the photographs are read anew.", base, error)
+        log.warning("%s is not used (%s); the photographs are read again.", base, error)
         return None
     if not sound:
-        log.warning("%s is damaged; the photographs are read anew.", path)
+        log.warning("%s is damaged; the photographs are read again.", path)
         return None
     if contents is not None and contents != header.contents:
-        log.info("%s was made from other contents, or they were not compared then; it is made anew.", path)
+        log.info("%s was made from other files, or without comparing them; it is made again.", path)
         return None
     return header
 
@@ -170,7 +170,7 @@ def _require_numbers(header: Header) -> None:
         len(size) == 2 and all(type(side) is int and 0 < side < LONGEST_SIDE for side in size) for size in header.sizes
     )
     if not sizes_fit or type(header.masked) is not bool or type(header.has_transparency) is not bool:
-        raise ValueError("sizes or switches that are none")
+        raise ValueError("invalid sizes or switches")
 
 
 def _spots(path: Path) -> int:

@@ -85,7 +85,7 @@ class AutoReader(CaptureReader):
         """Return what the format says, where it is one of photographs with their poses."""
         reader = self.reader()
         if not isinstance(reader, CaptureReader):
-            raise InputError(f"{self.root} is no capture of photographs with poses. Name its format with scene=...")
+            raise InputError(f"{self.root} is not a capture of photographs with poses. Name its format with scene=...")
         return reader.capture()
 
     def reader(self) -> Reader:
@@ -103,7 +103,7 @@ class AutoReader(CaptureReader):
         refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
         if refused:
             raise InputError(
-                f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it."
+                f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it out."
             )
         return known.reader(**chosen)
 
@@ -126,8 +126,8 @@ class AutoReader(CaptureReader):
             return found[0]
         formats = listed((Known(folder, "", reader).scene for reader in readers()), len(readers()))
         raise InputError(
-            f"{self.root} holds no capture of a format that is known here ({formats}): it holds {contents(folder)}."
-            f"{self._hint()} If these are photographs whose cameras nobody knows yet, use scene=photos."
+            f"{self.root} holds no capture in a known format ({formats}): it holds {contents(folder)}.{self._hint()} "
+            "If these are photographs without cameras, use scene=photos."
         )
 
     def _named_file(self) -> Known | None:
@@ -164,12 +164,12 @@ OF_OTHERS: tuple[tuple[tuple[str, ...], str], ...] = (
         ("*.csv",),
         "If the csv file is RealityScan's (RealityCapture's) list of cameras, export its COLMAP format instead.",
     ),
-    (("*.xmp",), "XMP files beside photographs are RealityScan's cameras: export its COLMAP format instead."),
+    (("*.xmp",), "XMP files next to photographs are RealityScan's cameras: export its COLMAP format instead."),
     (
         ("ARWorldMap*",),
         "It looks like a recording of ARKit: convert it to a transforms.json (nerfstudio reads several such apps).",
     ),
-    (("*.json",), "A transforms.json by another name is read with scene=transforms scene.file=NAME."),
+    (("*.json",), "A transforms.json under another name is read with scene=transforms scene.file=NAME."),
     (
         ("*.psx",),
         "A .psx is a project of Metashape: export its cameras as Agisoft XML (File > Export > Export Cameras).",

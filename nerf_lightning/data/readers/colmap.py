@@ -113,7 +113,9 @@ class ColmapReader(CaptureReader):
                     raise InputError(_absent(image.name, pictures, folder))
                 camera = model.cameras.get(image.camera)
                 if camera is None:
-                    raise InputError(f"{folder}: {image.name} names a camera that is not there: {image.camera}. {CURE}")
+                    raise InputError(
+                        f"{folder}: {image.name} names a camera that does not exist: {image.camera}. {CURE}"
+                    )
                 _require_known(camera, folder)
                 views.append(_view(image, camera, files[image.name]))
                 kept.append(image)
@@ -192,13 +194,14 @@ def _tracks(images: Sequence[ColmapImage], points: ColmapPoints) -> Int[ndarray,
 def _absent(name: str, pictures: Path, folder: Path) -> str:
     if named_picture(pictures, name):
         return (
-            f"The model in {folder} names {name}, which leads out of the capture's folder: it may be a stranger's. If "
-            "this capture is yours, add scene.allow_outside=true; else copy the photograph into the folder."
+            f"The model in {folder} names {name}, which leads out of the capture's folder and is not followed, for "
+            "safety. If this capture is yours, add scene.allow_outside=true; otherwise copy the photograph into the "
+            "folder."
         )
     if is_absolute(name):
         return (
-            f"The model in {folder} names photographs by absolute paths of another machine: {name}. No picture below "
-            f"{pictures} fits its end. Copy the photographs there, or set scene.images to their folder."
+            f"The model in {folder} names photographs by absolute paths of another machine: {name}. No picture "
+            f"below {pictures} matches its end. Copy the photographs there, or set scene.images to their folder."
         )
     return (
         f"{pictures} lacks the photograph {name} of the model in {folder}. Copy it there, or set scene.images to the "
@@ -221,9 +224,9 @@ def _require_known(camera: ColmapCamera, folder: Path) -> None:
         return
     terms = " with terms that ours do not have" if camera.model in LAYOUTS else ""
     raise InputError(
-        f"{folder} uses the camera model {camera.model}{terms}, whose lens is not known here; known are "
-        f"{listed(LAYOUTS, len(LAYOUTS))}. Undistort the photographs with `colmap image_undistorter`, or reconstruct "
-        "with OPENCV (or OPENCV_FISHEYE)."
+        f"{folder} uses the camera model {camera.model}{terms}, whose lens is not supported; supported "
+        f"are {listed(LAYOUTS, len(LAYOUTS))}. Undistort the photographs with `colmap image_undistorter`, or "
+        "reconstruct with OPENCV (or OPENCV_FISHEYE)."
     )
 
 

@@ -51,7 +51,7 @@ LONGEST_LINE = 1 << 24
 """In characters; that of a photograph with a hundred thousand features takes less."""
 MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
 """So many points, spread over all, say where they were seen, unless in more photographs."""
-CURE = "Copy the model again, or run the reconstruction anew (nerf poses images=DIR)."
+CURE = "Copy the model again, or run the reconstruction again (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 
 
@@ -160,7 +160,7 @@ class _Bytes:
         """Return the length of a list whose entries take at least so many bytes."""
         count = int(self.take("<Q")[0])
         if count * least_bytes > len(self.data) - self.place:
-            raise ValueError(f"it announces {count:,} entries, and has {len(self.data)} bytes")
+            raise ValueError(f"it claims {count:,} entries, but has {len(self.data)} bytes")
         require_within(budget, count, str(self.path), budget)
         return count
 
@@ -182,7 +182,7 @@ class _Bytes:
 
     def end(self) -> None:
         if self.place != len(self.data):
-            raise ValueError(f"it announces {self.place:,} bytes, and has {len(self.data):,}")
+            raise ValueError(f"it claims {self.place:,} bytes, but has {len(self.data):,}")
 
 
 class TextFiles:
@@ -253,7 +253,7 @@ def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterat
     for number, line in enumerate(lines):
         if number == most:
             raise InputError(
-                f"{path} has more than {most:,} {budget}, the limit. If you trust it, "
-                f"add budgets.{budget}=N; else use another file."
+                f"{path} has more than {most:,} {budget}, the limit. If you trust it, add budgets.{budget}=N; "
+                "otherwise use another file."
             )
         yield line

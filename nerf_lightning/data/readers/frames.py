@@ -67,7 +67,7 @@ class FrameFile:
         if content.get("from_mitsuba"):
             raise InputError(
                 f"{path} says from_mitsuba, and Mitsuba's cameras look along other axes than those of Blender and "
-                "nerfstudio. Turn the sign of the first and the third column of each transform_matrix, and remove it."
+                "nerfstudio. Negate the first and third columns of each transform_matrix, and remove it."
             )
         return cls(path, {key: value for key, value in content.items() if value is not None}, frames)
 
@@ -86,7 +86,7 @@ def say_of_files(files: Sequence[FrameFile]) -> None:
     }
     if len(times) > 1:
         log.warning(
-            "%s: time differs between frames, and the scene is taken as static: moving content is blurred", first
+            "%s: time differs between frames, but the scene is treated as static: moving content is blurred", first
         )
 
 
@@ -153,16 +153,16 @@ def _absent(path: Path, root: Path, where: str, name: str) -> str:
     if named_picture(path.parent, name):
         return (
             f"{where}: file_path is {name}, which leads out of the capture's folder {root}: it may be a stranger's. If "
-            "this capture is yours, add scene.allow_outside=true; else copy the picture into the folder."
+            "this capture is yours, add scene.allow_outside=true; otherwise copy the picture into the folder."
         )
     if is_absolute(name):
         return (
-            f"{where}: file_path is {name}, an absolute path of another machine, and no picture below {root} fits its "
-            "end. Copy the pictures there."
+            f"{where}: file_path is {name}, an absolute path of another machine, and no picture below {root} matches "
+            "its end. Copy the pictures there."
         )
     return (
-        f"{where}: the image {named} does not exist, with another ending neither. Copy it there, or remove its frame "
-        "from the file."
+        f"{where}: the image {named} does not exist, and neither does one with another extension. Copy it there, or "
+        "remove its frame from the file."
     )
 
 
@@ -182,7 +182,7 @@ def number_of(settings: dict[str, Any], key: str, where: str, default: float | N
     try:
         return float(value)
     except OverflowError:
-        raise InputError(f"{where}: {key} has too many digits for a number of a camera. Fix it.") from None
+        raise InputError(f"{where}: {key} has too many digits. Fix it.") from None
 
 
 def positive_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
@@ -211,8 +211,8 @@ def focal_of(settings: dict[str, Any], width: float, height: float, where: str) 
             found.append(focal_of_angle(settings, side, length, where))
     if not found:
         raise InputError(
-            f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) stands in it or at the "
-            "file's top. If the file comes from another tool, export it in nerfstudio's or instant-ngp's format."
+            f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) is given in it or at the "
+            "top of the file. If the file comes from another tool, export it in nerfstudio's or instant-ngp's format."
         )
     return found[0], found[-1]
 
@@ -244,16 +244,14 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     kind = LENSES.get(model.strip().upper()) if isinstance(model, str) else None
     if kind is None:
         raise InputError(
-            f"{where} has the camera_model {model!r}; known are {listed(LENSES, len(LENSES))}. Undistort the "
+            f"{where} has the camera_model {model!r}; supported are {listed(LENSES, len(LENSES))}. Undistort the "
             "photographs first, or export them as perspective pictures."
         )
     if kind in ("pinhole", "equirectangular") and any(lens):
-        raise InputError(
-            f"{where} has the camera_model {model} and distortion coefficients. Remove the one or the other."
-        )
+        raise InputError(f"{where} has the camera_model {model} and distortion coefficients. Remove one of them.")
     if str(model).upper() == "FULL_OPENCV" and any(number_of(settings, key, where, 0.0) for key in RATIONAL):
         raise InputError(
-            f"{where} has the camera_model {model} with k4, k5 or k6, which divide the distortion and are not known "
-            "here. Calibrate with OPENCV, or undistort the photographs."
+            f"{where} has the camera_model {model} with k4, k5 or k6, which divide the distortion and are not "
+            "supported. Calibrate with OPENCV, or undistort the photographs."
         )
     return ("pinhole" if kind == "radial_tangential" and not any(lens) else kind), lens

@@ -70,9 +70,9 @@ class LlffReader(CaptureReader):
             names = registered
         if len(names) != len(rows):
             raise InputError(
-                f"{path} has {len(rows)} poses, but {folder} has {len(names)} photographs, and they belong together "
-                "in order of names. Remove the photographs that were not registered (or name those that were in "
-                "view_imgs.txt, a line for each), or add those that are missing."
+                f"{path} has {len(rows)} poses, but {folder} has {len(names)} photographs, and both are paired in the "
+                "order of their names. Remove the photographs that were not registered (or list those that were in "
+                "view_imgs.txt, one per line), or add those that are missing."
             )
         names = self._sorted(names, path)
         views = []

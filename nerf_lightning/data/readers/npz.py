@@ -30,7 +30,7 @@ from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
 LAYOUT = "It needs images (n, height, width, 3), poses (n, 4, 4) camera-to-world and one focal length in pixels."
-ALLOW = "If you trust it, allow more with scene.max_gigabytes=N; else use another file."
+ALLOW = "If you trust it, allow more with scene.max_gigabytes=N; otherwise use another file."
 CURE = f"Remove it, and copy or download it again. {LAYOUT}"
 
 

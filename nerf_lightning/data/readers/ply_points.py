@@ -40,11 +40,11 @@ def read_ply_points(path: Path) -> ColmapPoints:
         if order == "ascii":
             rows = np.loadtxt(file, max_rows=count, ndmin=2, comments=None) if count else np.zeros((0, 3))
             if len(rows) < count:
-                raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
+                raise InputError(f"{path} is cut short: it claims {count} points. {CURE}")
             columns = [rows[:, list(kind.names or ()).index(axis)] for axis in "xyz"]
         else:
             if os.fstat(file.fileno()).st_size - body < count * kind.itemsize:
-                raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
+                raise InputError(f"{path} is cut short: it claims {count} points. {CURE}")
             table = np.frombuffer(file.read(count * kind.itemsize), kind, count)
             columns = [table[axis] for axis in "xyz"]
     positions = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)

@@ -128,7 +128,7 @@ class TransformsReader(CaptureReader):
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
-                "%s: of %d files (%s) %d are not there, or no pictures: %s",
+                "%s: of %d files (%s) %d are missing or are not pictures: %s",
                 path,
                 len(wanted),
                 key,
@@ -209,7 +209,7 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
             raise InputError(f"{path}: {split}_filenames must be a list of file names. Fix it, or remove it.")
         lost = [name for name in names if _plain(name) not in numbers and _plain(name) not in listed_at_all]
         if lost:
-            log.warning("%s: %s_filenames lists %s, which no frame has; this is passed over", path, split, listed(lost))
+            log.warning("%s: %s_filenames lists %s, which no frame has; these are ignored", path, split, listed(lost))
         splits[split] = tuple(dict.fromkeys(numbers[_plain(name)] for name in names if _plain(name) in numbers))
     unused = [each.view.name for number, each in enumerate(found) if all(number not in splits[key] for key in SPLITS)]
     if unused:
@@ -261,7 +261,8 @@ def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
         applied[:3] = pose_from_matrix(content["applied_transform"], f"{where}: applied_transform")
         if not is_rigid(applied[:3] / unit_of(applied)):
             raise InputError(
-                f"{where}: applied_transform must turn, move and scale alike along all axes. Fix it, or remove it."
+                f"{where}: applied_transform must be a rotation, a shift and the same scale along all axes. Fix it, or "
+                "remove it."
             )
     applied[:3] *= positive_of(content, "applied_scale", where, 1.0)
     return torch.linalg.inv(applied)

@@ -59,8 +59,8 @@ def find_cameras(
     if not best:
         raise NothingFoundError(
             f"No camera could be placed: the {len(photographs)} pictures {cause}. Take more photographs that overlap "
-            "by two thirds, from places some steps apart (do not turn on the spot), sharp, with one zoom and without "
-            "mirrors or bare walls filling the picture; then try again.",
+            "by two thirds, from positions a few steps apart (do not turn on the spot), sharp, with one zoom and "
+            "without mirrors or bare walls filling the picture; then try again.",
             cause,
         )
     align_to_gps(require_pycolmap(), best[0], folder)

@@ -35,7 +35,8 @@ def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
     images = folder / "images"
     if images.exists() and (is_video or not source.is_dir() or not images.samefile(source)):
         raise InputError(
-            f"{images} exists already, and is not what images= names. Give an empty folder with paths.output_dir=DIR."
+            f"{images} exists already, and is not the folder given with images=. Give an empty folder with "
+            "paths.output_dir=DIR."
         )
 
 
@@ -67,9 +68,8 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple
     anew = [photograph.path.name for photograph in photographs if not photograph.as_it_is]
     if in_place and anew:
         raise InputError(
-            f"{listed(anew)} in {source} are stored turned (EXIF orientation), or in a format that COLMAP does not "
-            "read, and must be written anew, but they lie in the output folder itself. Give another folder with "
-            "paths.output_dir=DIR."
+            f"{listed(anew)} in {source} are rotated by EXIF, or in a format that COLMAP does not read, and must be "
+            "converted, but they are in the output folder itself. Give another folder with paths.output_dir=DIR."
         )
     costs = {READING: READING_COST * sum(p.width * p.height for p in photographs) / 1e6}
     with _unfinished(folder) as work:

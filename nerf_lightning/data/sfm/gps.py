@@ -87,13 +87,12 @@ def align_to_gps(colmap: Any, model: Any, folder: Path) -> bool:
     off = np.linalg.norm(np.stack([found * centers[name] for name in places]) - wanted, axis=1)
     across = np.linalg.svd(wanted, compute_uv=False)[1] / math.sqrt(len(wanted))
     if across < LEAST_SPREAD * np.median(off):
-        log.info(
-            "cameras: GPS places are off by %.1f m, too much for photographs so near to each other", np.median(off)
-        )
+        log.info("cameras: GPS positions are off by %.1f m, too much for photographs so close together", np.median(off))
         return False
     model.transform(found)
     log.info(
-        "cameras: placed by the GPS of %d photographs, to %.1f m: units are meters, z is up (scene.metres_per_unit=1)",
+        "cameras: aligned with the GPS positions of %d photographs, to %.1f m: units are meters, z is up "
+        "(scene.metres_per_unit=1)",
         *(len(places), np.median(off)),
     )
     return True

@@ -89,8 +89,8 @@ def find_photographs(folder: Path) -> list[FoundPhotograph]:
     odd = [path.name for path in pictures if not is_plain(path.name)]
     if odd:
         log.warning(
-            "%d of %d photographs are left out, since their names are not UTF-8 or hold control characters: %s. Rename "
-            "them, and they are taken.",
+            "%d of %d photographs are left out because their names are not UTF-8 or contain control characters: %s. "
+            "Rename them to use them.",
             *(len(odd), len(pictures), listed(odd, 5)),
         )
         pictures = [path for path in pictures if is_plain(path.name)]
@@ -156,8 +156,8 @@ def _photograph(path: Path) -> FoundPhotograph:
     width, height = image_size(path)
     if min(width, height) < SMALLEST_SIDE:
         raise InputError(
-            f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
-            f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
+            f"{path} is {width} x {height} pixels: too small to find details in it. Remove thumbnails and icons from "
+            f"the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
     turned, is_panorama, lens, has_alpha = _said_of(path)
     # Orientations 5 to 8 are quarter turns.
@@ -189,7 +189,7 @@ def _write_anew(path: Path, target: Path) -> None:
             profile = image.info.get("icc_profile")
     except DECODER_ERRORS as error:
         raise InputError(
-            f"{path} cannot be written anew: {error}. It may be damaged or cut short; copy it from the camera again."
+            f"{path} cannot be converted: {error}. It may be damaged or cut short; copy it from the camera again."
         ) from error
     # PNG and TIFF take no notice of the quality.
     upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
@@ -208,5 +208,5 @@ def _too_few(folder: Path, pictures: list[Path], files: list[Path]) -> str:
         cure = " Convert raw photographs to JPEG first; a film is given with video=FILE."
     else:
         others, cure = "nothing", ""
-    folders = f" It has folders of its own ({listed(inside, cap=4)}): was one of them meant?" if inside else ""
+    folders = f" It has subfolders ({listed(inside, cap=4)}): was one of them meant?" if inside else ""
     return f"images={folder} holds no PNG, JPEG, TIFF, WebP, AVIF or HEIC, {others}.{folders}{cure}"

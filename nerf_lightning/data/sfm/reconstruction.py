@@ -45,7 +45,7 @@ FEWEST_POINTS = 30
 """That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
-WITHOUT_DEPTH = "show the same details without depth, all from one place or of one flat thing"
+WITHOUT_DEPTH = "show the same details without depth, all from one position or of one flat surface"
 """Why nothing was found, where more than half of the compared pairs say so."""
 
 

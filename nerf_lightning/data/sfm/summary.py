@@ -32,15 +32,15 @@ def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
     lines = []
     if model.apart:
         lines.append(
-            f"{listed(model.apart, 4)} fit together and not to the rest: if they show another place, they belong in a "
-            "capture of their own; if not, photographs between the two are missing."
+            f"{listed(model.apart, 4)} fit together but not with the rest: if they show another place, make a separate "
+            "capture of them; if not, photographs between the two are missing."
         )
     if len(model.registered) < ENOUGH * (len(model.registered) + len(model.left_out)):
         more = (
             "film slowly, walking rather than turning; a smaller every= takes more frames of this video."
             if is_video
             else "take more photographs between those left out and the others (overlapping by two thirds), sharp ones, "
-            "with one zoom and from places some steps apart."
+            "with one zoom and from positions a few steps apart."
         )
         pairs = " matching=exhaustive compares every photograph with every other." if matching == "sequential" else ""
         lines.append(f"few were registered: {more}{pairs}")

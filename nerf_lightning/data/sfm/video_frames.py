@@ -160,6 +160,6 @@ def require_video(path: Path) -> None:
     stream = any(start[first::length][:3] == bytes([SYNC]) * 3 for first, length in PACKETS)
     if not (known or riff or stream):
         raise InputError(
-            f"{path} is not a video that is read here: mp4, mov, mkv, webm, avi, ts, mpg, flv, ogg, wmv and gif are. "
+            f"{path} is not in a supported video format (mp4, mov, mkv, webm, avi, ts, mpg, flv, ogg, wmv, gif). "
             "Playlists and scripts of ffmpeg are not followed. Convert it to an mp4 (H.264)."
         )

@@ -46,8 +46,8 @@ def bake(
         around = who_sees(grid, np.argwhere(kept).astype(np.int32), record, num_harmonics, report)
     if not (kept.any() and (around.cameras[:, 0] >= 0).any()):
         raise InputError(
-            f"Nothing of {for_terminal(record.name)} is seen: no training camera looks at what has density. Correct "
-            "the box (scene.aabb_half) or the cameras' poses, and train again."
+            f"Nothing of {for_terminal(record.name)} is seen: no training camera sees anything that has density. "
+            "Correct the box (scene.aabb_half) or the cameras' poses, and train again."
         )
     grid.optical[~kept] = 0.0
     colored = around.only((around.cameras[:, 0] >= 0) & kept[tuple(around.voxels.T)])

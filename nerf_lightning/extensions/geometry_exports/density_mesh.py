@@ -58,7 +58,7 @@ def _level(
     lowest, highest = float(density.min()), float(density.max())
     if level is not None and lowest < level < highest:
         return level
-    found = f"the densities of its box go from {lowest:.3g} to {highest:.3g} per scene unit"
+    found = f"the densities in its box range from {lowest:.3g} to {highest:.3g} per scene unit"
     if level is None:
         missing, seen = "", ", and no training view sees anything opaque there"
     else:
@@ -130,6 +130,6 @@ def seen_faces(
     if not kept.any():
         raise InputError(
             "No training view sees any part of the mesh as its surface: what.threshold is far from the density that "
-            "the views end in. Give another, or what.threshold=null, or what.seen_only=false."
+            "the views end in. Give another, what.threshold=null, or what.seen_only=false."
         )
     return np.ascontiguousarray(faces[kept])

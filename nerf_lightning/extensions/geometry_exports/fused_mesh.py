@@ -41,7 +41,7 @@ def mesh_of_depth(
 
     `truncation` says how far before and behind a surface its distance is kept, in cells.
     """
-    fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or take what.surface=density.", __package__)
+    fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or use what.surface=density.", __package__)
     lower, reach = lattice.lower.numpy(), truncation * lattice.spacing
     distance, weight = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
     rays_of = depth_rays(record, max(lattice.shape))
@@ -62,8 +62,8 @@ def mesh_of_depth(
     faces = faces[_known(vertices, faces, weight)]
     if not len(faces):
         raise InputError(
-            f"No surface of {for_terminal(record.name)} is seen well enough to be a mesh: each of its places is seen "
-            "at a grazing angle only, or by coarse pixels. Give a smaller what.resolution, or what.surface=density."
+            f"No surface of {for_terminal(record.name)} is seen well enough to be a mesh: all of it is seen only at "
+            "grazing angles or by coarse pixels. Give a smaller what.resolution, or what.surface=density."
         )
     return lattice.to_scene(vertices), faces
 

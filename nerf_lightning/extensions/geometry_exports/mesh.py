@@ -103,7 +103,7 @@ class MeshExport(Export):
         if self.surface == "tsdf" and self.threshold is not None:
             raise InputError(f"what.threshold={self.threshold} belongs to what.surface=density. Leave one of them out.")
         if self.surface == "tsdf" and not self.seen_only:
-            raise InputError("what.seen_only=false asks for a closed mesh. Take what.surface=density for it.")
+            raise InputError("what.seen_only=false asks for a closed mesh, which needs what.surface=density.")
         if self.texture and self.format == "ply":
             raise InputError("what.format=ply has no texture. Give what.format=glb (one file), or obj (three).")
         if self.texture and self.faces is None:

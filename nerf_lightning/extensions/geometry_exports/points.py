@@ -66,7 +66,7 @@ class PointsExport(Export):
         for name, least in {"num_points": 1, "max_views": 1, "longest": 2, "agreement": 0}.items():
             value = getattr(self, name)
             require_setting(name, value, value >= least, f"give {least} or more.")
-        asked = f"{NEIGHBOURS} other views are asked, so give at most that."
+        asked = f"{NEIGHBOURS} other views are compared, so give at most that number."
         require_setting("agreement", self.agreement, self.agreement <= NEIGHBOURS, asked)
         shares = "give a share of the light, from 0 to below 1."
         require_setting("min_opacity", self.min_opacity, 0 <= self.min_opacity < 1, shares)

@@ -126,8 +126,8 @@ class TextureMaker:
             report("texels", part.stop / max(1, len(texels.row)))
         if not seen.any():
             raise InputError(
-                f"No training view of {for_terminal(self.record.name)} sees the mesh, so that there is nothing to make "
-                "a texture of. Leave what.texture=true out, or train longer."
+                f"No training view of {for_terminal(self.record.name)} sees the mesh, so there is nothing to make a "
+                "texture from. Leave out what.texture=true, or train longer."
             )
         known = seen.numpy()
         picture, empty = np.zeros((size, size, 3), np.uint8), np.ones((size, size), bool)

@@ -73,7 +73,7 @@ class MetashapeReader(CaptureReader):
         path = self._path(root)
         text = read_text(path, limits().json_bytes, CURE)
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise InputError(f"{path} declares entities of its own, which no file of Metashape's does. {CURE}")
+            raise InputError(f"{path} declares XML entities, which files of Metashape never do. {CURE}")
         chunk = _chunk(text, path)
         left_out = LeftOut(str(path))
         cameras = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("label")]
@@ -92,7 +92,7 @@ class MetashapeReader(CaptureReader):
                 lenses.add(sensor.lens_model)
         left_out.require_enough(len(views))
         if terms := sorted({each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and _number(each.text, path)}):
-            log.warning("%s: the lens has %s, which is not known here and is left out", path, " and ".join(terms))
+            log.warning("%s: the lens has %s, which is not supported and is left out", path, " and ".join(terms))
         posed = {view.name for view in views} | left_out.faults.keys()
         left_out.without_pose = tuple(label for label in labels if label not in posed)
         lens_model = one_lens_model(lenses, path)
@@ -132,7 +132,7 @@ def _chunk(text: str, path: Path) -> Element:
     aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None] or chunks
     if len(chunks) > 1:
         log.warning(
-            "%s: of %d chunks the first with aligned cameras is read. Export each alone to read another",
+            "%s: of %d chunks the first with aligned cameras is read. To read another, export it alone",
             *(path, len(chunks)),
         )
     return aligned[0]
@@ -191,7 +191,7 @@ def _chunk_to_world(chunk: Element, path: Path) -> Float[Tensor, "4 4"]:
     if (len(rotation), len(shift)) == (9, 3):
         matrix[:3] = torch.cat([matrix.new_tensor(rotation).reshape(3, 3), matrix.new_tensor(shift)[:, None]], dim=1)
     if (len(rotation), len(shift)) != (9, 3) or not is_rigid(matrix[:3]):
-        raise InputError(f"{path}: the chunk's transform is no rotation with a shift and a scale. {CURE}")
+        raise InputError(f"{path}: the chunk's transform is not a rotation, a shift and a scale. {CURE}")
     matrix[:3, :3] *= scale
     return matrix
 

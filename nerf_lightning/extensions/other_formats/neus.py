@@ -59,8 +59,8 @@ class NeusReader(CaptureReader):
         names = picture_files(folder)
         if len(names) != len(world):
             raise InputError(
-                f"{path} has {len(world)} cameras, but {folder} has {len(names)} photographs, and they belong together "
-                "in order of names. Copy those that are missing, or set scene.images to their folder."
+                f"{path} has {len(world)} cameras, but {folder} has {len(names)} photographs, and both are paired in "
+                "the order of their names. Copy those that are missing, or set scene.images to their folder."
             )
         if numeric_order(names) != names:
             log.warning(
@@ -117,7 +117,7 @@ def _decomposed(
     """Return K, R (world to camera) and the center of P = K [R | -R c], by an RQ decomposition."""
     flipped = np.flipud(projection[:, :3]).T
     if not np.isfinite(projection).all() or abs(np.linalg.det(flipped)) < 1e-12:
-        raise InputError(f"{where} is no projection: it holds NaN or infinity, or is singular. {CURE}")
+        raise InputError(f"{where} is not a projection: it holds NaN or infinity, or is singular. {CURE}")
     q, r = np.linalg.qr(flipped)
     k, rotation = np.flipud(np.fliplr(r.T)), np.flipud(q.T)
     signs = np.sign(np.diag(k))

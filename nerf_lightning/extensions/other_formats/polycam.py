@@ -65,7 +65,7 @@ def _folders_in(root: Path) -> tuple[Path, Path] | None:
 def _view(path: Path, picture: Path, depth: Path) -> View:
     said = read_json(path)
     if not isinstance(said, dict):
-        raise InputError(f"{path} is no json object with a pose. Export the capture again.")
+        raise InputError(f"{path} is not a JSON object with a pose. Export the capture again.")
     matrix = [[number_of(said, f"t_{row}{column}", str(path)) for column in range(4)] for row in range(3)]
     fx, fy, cx, cy, width, height = (
         number_of(said, key, str(path)) for key in ("fx", "fy", "cx", "cy", "width", "height")

@@ -54,8 +54,8 @@ def mean_activity(
     unasked = [name for name, count in counts.items() if not count]
     if unasked:
         raise InputError(
-            f"No ray of the training views asks model.{unasked[0]} about any point, so that nothing is known of "
-            "what its neurons do. Choose them by=importance."
+            f"No ray of the training views evaluates model.{unasked[0]} at any point, so its neurons' activity is "
+            "unknown. Choose by=importance."
         )
     return {name: [layer / counts[name] for layer in layers] for name, layers in sums.items()}
 

@@ -29,7 +29,7 @@ class Pruning:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.keep <= 1.0:
-            raise InputError(f"keep={self.keep}: give the share of neurons that stay, above 0 and up to 1 (all).")
+            raise InputError(f"keep={self.keep}: give the share of neurons to keep, above 0 and up to 1 (all).")
         require_positive(round_to=self.round_to)
 
     def width(self, there: int, where: str) -> int:

@@ -46,7 +46,7 @@ def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dic
         raise InputError(f"tables={tables}: this model has no hash tables. Leave it out.")
     if drop_empty and not grids:
         raise InputError(
-            "drop_empty=true: this model has no occupancy grid, which would say what is empty. Leave it out."
+            "drop_empty=true: this model has no occupancy grid, so what is empty is unknown. Leave it out."
         )
     levels = {name: part for name, part in model.named_modules() if isinstance(part, Level)} if drop_empty else {}
     reached = {f"{name}.field.position_encoder": reached_entries(level) for name, level in levels.items()}

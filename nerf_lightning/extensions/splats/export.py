@@ -107,8 +107,8 @@ class SplatsExport(Export):
     def _require_possible(self, record: SceneRecord) -> None:
         if record.cameras.lens_model == "equirectangular":
             raise InputError(
-                f"what=splats: {record.name} is made of panoramas, and splats are fitted to pictures that a "
-                "pinhole could have taken. what=points and what=mesh take panoramas."
+                f"what=splats: {record.name} consists of panoramas, and splats are fitted to pinhole pictures. "
+                "what=points and what=mesh accept panoramas."
             )
         if self.format == "spz":
             require_library()  # before the work, not after it
@@ -186,7 +186,7 @@ def _lines(known: dict[str, Any]) -> list[str]:
     splats, field = known["splats_metrics"], known.get("field_metrics")
     psnr = f"{splats['psnr']:.2f} dB on {known['views']} views"
     if field is None:
-        psnr += ", the field's pictures taken for the truth"
+        psnr += ", with the field's renders as the truth"
     else:
         ssim = "" if field["ssim"] is None else f"; SSIM {splats['ssim']:.3f} and {field['ssim']:.3f}"
         gain = splats["psnr"] - field["psnr"]

@@ -145,8 +145,8 @@ class ViewTransformer(Model):
         """
         if photographs.background in DRAWN:
             raise InputError(
-                "model=view_transformer renders what photographs show, and of "
-                f"scene.background={photographs.background} they show nothing: give scene.background=white or black."
+                "model=view_transformer renders what photographs show, and they do not show "
+                f"scene.background={photographs.background}: give scene.background=white or black."
             )
         counts = torch.bincount(photographs.capture)
         fewest = int(counts[counts > 0].min()) if len(counts) else 0
@@ -248,6 +248,6 @@ class ViewTransformer(Model):
         if not self.training and not self.warned and float(opacity.mean()) < LEAST_SEEN:
             self.warned = True
             log.warning(
-                "no photograph that is looked at sees anything of most rays, and they show the background: the camera "
-                "stands outside of what the capture covers"
+                "no photograph sees most of the rays, so they show the background: the camera is outside what the "
+                "capture covers"
             )

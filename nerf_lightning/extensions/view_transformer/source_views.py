@@ -58,8 +58,8 @@ def choose_sources(photographs: Photographs, rays: RayBundle, count: int, random
     distance = distance.masked_fill(other | itself, torch.inf)
     if not bool(distance.isfinite().any(dim=1).all()):
         raise InputError(
-            "A view is to be rendered from photographs of its capture, and there is none but its own. Give the capture "
-            "more photographs to train on, or take it out."
+            "A view is rendered from other photographs of its capture, and there are none. Give the capture more "
+            "photographs to train on, or take it out."
         )
     num_views = distance.shape[1]
     if random is None:

@@ -24,7 +24,7 @@ class WeightedSum(Loss):
         super().__init__()
         self.terms, self.weights = nn.ModuleDict(terms), dict(weights or {})
         if unknown := sorted(self.weights.keys() - terms.keys()):
-            raise ValueError(f"weights names {unknown[0]}, which is no loss: there are {', '.join(terms)}")
+            raise ValueError(f"weights names {unknown[0]}, which is not a loss: there are {', '.join(terms)}")
         sides = {loss.patch for loss in terms.values()} - {1}
         if len(sides) > 1:
             raise ValueError(f"the losses look at squares of {sorted(sides)} pixels a side: give all the same patch")

@@ -80,8 +80,8 @@ class SE3Delta(Refinement):
         if scene.cameras.ndc is not None:
             raise InputError(
                 f"refinement: the scene {scene.name} is trained in normalized device coordinates (scene.space=ndc), "
-                "which bend all rays as one camera that looks straight ahead sees them, so a camera that turns would "
-                "no longer fit the others. Train with scene.space=contracted, or with refinement=none."
+                "which assume cameras that look straight ahead, so a rotated camera would no longer fit the others. "
+                "Train with scene.space=contracted, or with refinement=none."
             )
         if (self.focal or self.lens) and scene.cameras.lens_model == "equirectangular":
             raise InputError(
@@ -91,8 +91,8 @@ class SE3Delta(Refinement):
         photographs = len(scene.splits["train"])
         if photographs < FEWEST_PHOTOGRAPHS:
             raise InputError(
-                f"refinement: the scene {scene.name} trains on {photographs} photograph, and where one camera stands "
-                "shows only against others. Give more photographs, or refinement=none."
+                f"refinement: the scene {scene.name} trains on {photographs} photograph, and a camera can be refined "
+                "only relative to others. Give more photographs, or refinement=none."
             )
         self.learn(scene.cameras, scene.aabb, photographs)
 

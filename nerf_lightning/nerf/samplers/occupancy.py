@@ -218,7 +218,7 @@ class OccupancySampler(RaggedSampler):
         if not intervals <= self.max_intervals:
             raise InputError(
                 f"A ray from near to far would be cut into {intervals:.3g} intervals of {self.step_size:.3g} scene "
-                f"units, and more than {self.max_intervals:,} are not taken. Give a smaller sampler.num_steps, or a "
+                f"units, and more than {self.max_intervals:,} are not allowed. Give a smaller sampler.num_steps, or a "
                 "larger box; or add budgets.intervals=N."
             )
 

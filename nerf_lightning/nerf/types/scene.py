@@ -16,7 +16,7 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
 """What lies behind the scene.
 
-`random`: a color drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
+`random`: a new color for each ray of a step, which teaches empty space to be empty; at evaluation white.
 `white_or_random`: the same, but white behind pixels that may show some of a background that was cut out (`UNSURE`).
 `black_or_random`: the same with black, which it is at evaluation, too. `none`: nothing. The last interval of a dense
 level takes all the light that is left; levels behind an occupancy grid have no such interval, and leave it black.

@@ -167,8 +167,8 @@ class CameraPath(ABC):
         lost = (~is_rigid(c2w)).nonzero().flatten().tolist()
         if lost:
             raise InputError(
-                f"The camera of frame {lost[0]} of the path looks along its own up axis, or at the very point where it "
-                f"stands ({len(lost)} of {len(c2w)} frames do), so its picture has no top. Move it, or give another up."
+                f"The camera of frame {lost[0]} of the path looks along its own up axis, or at its own position "
+                f"({len(lost)} of {len(c2w)} frames do), so its picture has no top. Move it, or give another up."
             )
         width, height, scale = around.size(self.width, self.height)
         focal = around.focal * scale if self.fov is None else focal_from_fov(width, math.radians(self.fov))

@@ -315,7 +315,7 @@ def test_unwritable_cache_costs_a_warning_and_its_folder_follows_the_environment
     blocked.write_text("in the way")
     small = BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(blocked / "bricks"))
     assert small.read().pixels.rgba.shape == (64, 4)
-    assert "rendered anew" in caplog.text
+    assert "rendered again" in caplog.text
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("NERF_LIGHTNING_CACHE", raising=False)
     assert default_folder("bricks") == tmp_path / "xdg" / "nerf_lightning" / "bricks"

@@ -150,7 +150,7 @@ def test_depth_maps_that_cannot_be_used_are_left_out_and_named_once(tmp_path, ca
     lines = [record.message for record in caplog.records if "depth maps" in record.message]
     assert len(lines) == 1
     assert lines[0].startswith("2 depth maps are left out: 1.png has another shape than its photograph")
-    assert "2.png is no gray picture of 16 bits" in lines[0]
+    assert "2.png is not a 16-bit grayscale picture" in lines[0]
 
 
 def test_a_map_of_many_pixels_is_thinned(tmp_path):

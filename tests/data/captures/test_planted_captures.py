@@ -154,7 +154,7 @@ def test_links_in_a_folder_of_photographs(tmp_path, secret):
 )
 def test_playlists_that_are_called_videos(tmp_path, text):
     (tmp_path / "a.mp4").write_text(text)
-    with pytest.raises(InputError, match=r"a.mp4 is not a video that is read here.*not followed"):
+    with pytest.raises(InputError, match=r"a.mp4 is not in a supported video format.*not followed"):
         count_frames(tmp_path / "a.mp4")
 
 
@@ -231,11 +231,11 @@ def bombs(tmp_path):
         root = WRITERS["colmap"](tmp_path / name)
         path = root / MODEL / f"{name}.bin"
         path.write_bytes(struct.pack("<Q", most) + path.read_bytes()[8:])
-        yield "colmap", root, "it announces .* Copy the model again"
+        yield "colmap", root, "it claims .* Copy the model again"
     root = WRITERS["colmap"](tmp_path / "sparse")
     with (root / MODEL / "points3D.bin").open("r+b") as file:
         file.truncate(50_000_000_000)
-    yield "colmap", root, "it announces .* bytes, and has 50,000"
+    yield "colmap", root, "it claims .* bytes, but has 50,000"
     root = WRITERS["text"](tmp_path / "line")
     with (root / MODEL / "images.txt").open("r+b") as file:
         file.truncate(20_000_000_000)
@@ -253,7 +253,7 @@ def bombs(tmp_path):
     root = WRITERS["transforms"](tmp_path / "long")
     with (root / "transforms.json").open("r+b") as file:
         file.truncate(20_000_000_000)
-    yield "transforms", root, "more than 67,108,864 are not read here"
+    yield "transforms", root, "more than the limit of 67,108,864"
 
 
 READ = """

@@ -22,17 +22,13 @@ def with_lists(root, train, test, **more):
 def test_what_is_tested_is_not_learnt_from(tmp_path, caplog):
     root = with_lists(tmp_path / "c", NAMES, NAMES[7:], val_filenames=NAMES[6:7])
     assert read("transforms", root).splits == {"train": tuple(range(6)), "val": (6,), "test": (7, 8)}
-    said = (
-        "3 of 9 views are listed both to learn from and to judge by, and are not learned from: images/p_6.png, images"
-    )
+    said = "3 of 9 views are listed both for training and as held out, and are not trained on: images/p_6.png, images"
     assert caplog.text.count(said) == 1
 
 
 def test_lists_that_leave_less_than_half_to_learn_from_have_two_readings(tmp_path):
     root = with_lists(tmp_path / "c", NAMES[:4], NAMES)
-    refused(
-        "transforms", root, r"4 of 4 views to learn from are to be judged by, too .* 0 would be left.*Take them out"
-    )
+    refused("transforms", root, r"4 of 4 training views are also held out .* 0 would be left.*Remove them")
 
 
 def test_one_list_for_both_is_meant_and_said(tmp_path, caplog):
@@ -40,7 +36,7 @@ def test_one_list_for_both_is_meant_and_said(tmp_path, caplog):
         scene = read("transforms", with_lists(tmp_path / str(count), NAMES[:count], NAMES[:count]))
         assert scene.splits["train"] == scene.splits["test"] == tuple(range(count))
         assert scene.protocol["test_views"] == "learned from"
-    assert "the views to learn from are those to judge by" in caplog.text
+    assert "the training views are also the test views" in caplog.text
 
 
 def test_a_picture_in_two_blender_files_is_one_view(tmp_path, caplog):
@@ -50,7 +46,7 @@ def test_a_picture_in_two_blender_files_is_one_view(tmp_path, caplog):
     scene = BlenderReader(str(root)).read()
     learnt, tested = ([scene.view_names[view][-3:] for view in scene.splits[split]] for split in ("train", "test"))
     assert (learnt, tested) == (["r_3", "r_4", "r_5", "r_6", "r_7"], ["r_0", "r_1", "r_2"])
-    assert "3 of 8 views are listed both to learn from and to judge by" in caplog.text
+    assert "3 of 8 views are listed both for training and as held out" in caplog.text
 
 
 def test_blender_files_that_are_copies_are_judged_by_what_is_learnt(tmp_path):

@@ -100,4 +100,4 @@ def test_of_sixteen_bits_it_is_said_once_what_is_kept(tmp_path, caplog):
     for name in ("a.png", "b.tif"):
         Image.fromarray(np.full((4, 4), 0x1234, np.uint16)).save(tmp_path / name)
         assert read_rgba(tmp_path / name)[0, 0, 0] == 0x12
-    assert caplog.messages == [f"{tmp_path}: pictures of 16 bits per channel are read with 8, the upper ones"]
+    assert caplog.messages == [f"{tmp_path}: pictures with 16 bits per channel are read with the upper 8"]

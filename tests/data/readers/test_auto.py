@@ -47,5 +47,5 @@ def test_settings_go_through_and_those_that_a_format_lacks_are_refused_by_name(t
 
 def test_a_folder_of_no_known_format_is_told_what_is_looked_for(tmp_path):
     write_npz(tmp_path / "tiny.npz")
-    with pytest.raises(InputError, match=r"known here \(blender, .*\): it holds tiny\.npz.*scene=photos"):
+    with pytest.raises(InputError, match=r"known format \(blender, .*\): it holds tiny\.npz.*scene=photos"):
         AutoReader(root=str(tmp_path)).read()

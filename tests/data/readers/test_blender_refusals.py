@@ -94,7 +94,7 @@ def test_leaves_out_a_view_that_cannot_be_used(root, caplog, content, message):
 
 
 def test_refuses_too_few_views(tmp_path, root):
-    refused(write_blender(tmp_path / "one", {"train": 1}), "leaves 0 to learn from and 1 to judge by")
+    refused(write_blender(tmp_path / "one", {"train": 1}), "leaves 0 for training and 1 for evaluation")
     (root / "transforms_train.json").write_text('{"camera_angle_x": 1, "frames": []}')
     refused(root, "scene has no views to learn from. Export transforms_train.json again")
 

@@ -101,7 +101,7 @@ def test_one_bad_frame_is_left_out_and_named(tmp_path, plain, caplog, fault):
     said_once(caplog, LEFT_OUT)
 
 
-FOUND = r"9 of 9 pictures are found by another name, such as "
+FOUND = r"9 of 9 pictures are found under another name, such as "
 NAMES = {
     "case": (named(str.upper), FOUND),
     "absolute": (named(lambda name: "/home/me/scan/" + name), FOUND),
@@ -150,7 +150,9 @@ def test_of_two_folders_that_fit_alike_neither_is_guessed(tmp_path):
     root = write_transforms(tmp_path / "c", KNOWN)
     named(lambda name: "/x/frames/" + name[7:], "a")(root)
     others(root, "b")
-    with pytest.raises(InputError, match=r"fit files of .*a, .*b alike\. Move all but one of these folders out"):
+    with pytest.raises(
+        InputError, match=r"match files of .*a, .*b equally well\. Move all but one of these folders out"
+    ):
         read(root)
 
 
@@ -347,7 +349,7 @@ def test_the_cameras_size_tells_how_a_photograph_lies(tmp_path, plain, caplog, o
     assert_plain(scene, plain)
     assert torch.equal(scene.pixels.kept(4), torch.from_numpy(mask == 255))
     if orientation in (3, 6, 8):
-        said_once(caplog, rf"{9 if quarter else 0} are read so, since only then")
+        said_once(caplog, rf"{9 if quarter else 0}, whose sizes match their cameras only then")
 
 
 def named_in(text):

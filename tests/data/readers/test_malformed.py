@@ -80,7 +80,7 @@ TRANSFORMS = {
     ),
     "a key twice": (
         text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")),
-        r"key 'fl_x' stands twice",
+        r"key 'fl_x' appears twice",
     ),
     "a thousand digits": (top(fl_x=10**1000), r"transforms.json: frames\[0\] .*: fl_x has too many digits"),
     "a camera path": (content(lambda _: PATH), r"lacks frames; it has camera_type, .* A transforms.json of"),
@@ -106,19 +106,28 @@ TRANSFORMS = {
     "numbers as text": (top(fl_x="20"), r"frames\[0\] .*: fl_x is '20', but it must be a number"),
     "no focal length": (top(fl_x=None, fl_y=None), r"has no focal length: neither fl_x \(pixels\) nor camera_angle_x"),
     "degrees": (top(fl_x=None, camera_angle_x=45.0), r"camera_angle_x is 45.0, but it must lie between 0 and pi"),
-    "half a panorama": (top(camera_model="VR180_L"), r"has the camera_model 'VR180_L'; known are PINHOLE, .* export"),
+    "half a panorama": (
+        top(camera_model="VR180_L"),
+        r"has the camera_model 'VR180_L'; supported are PINHOLE, .* export",
+    ),
     "a panorama of more than a turn": (top(**PANORAMA, fl_x=5.0, fl_y=12.0), r"with fl_x=5 and fl_y=12 for 16 x 12"),
     "a bent pinhole": (top(camera_model="PINHOLE", k1=0.1), r"has the camera_model PINHOLE and distortion"),
     "a panorama among others": (frame(1, **PANORAMA, fl_x=8.0, fl_y=12.0), r"mixes lenses of several kinds \(equirect"),
     "a fisheye among others": (frame(1, camera_model="OPENCV_FISHEYE", k1=0.1), r"mixes lenses of .*fisheye, pinhole"),
     "a tangential fisheye": (top(camera_model="OPENCV_FISHEYE", p1=0.1), r"The lens of images/p_0.png .*tangential"),
-    "a mask by number": (frame(1, mask_path=3), r"of 1 files \(mask_path\) 1 are not there, or no pictures: 3"),
-    "an absent mask": (frame(1, mask_path="a.png"), r"of 1 files \(mask_path\) 1 are not there, or no pictures: a.png"),
+    "a mask by number": (frame(1, mask_path=3), r"of 1 files \(mask_path\) 1 are missing or are not pictures: 3"),
+    "an absent mask": (
+        frame(1, mask_path="a.png"),
+        r"of 1 files \(mask_path\) 1 are missing or are not pictures: a.png",
+    ),
     "a mask of another size": (mask((4, 4)), r"The mask \S+m.png has 4 x 4 pixels, but its photograph \S+p_1.png has"),
-    "a split of absent views": (top(train_filenames=["a\nb"]), r"names no view to learn from that is there"),
+    "a split of absent views": (top(train_filenames=["a\nb"]), r"lists no training view that exists"),
     "a split that is text": (top(train_filenames="p_0.png"), r"train_filenames must be a list of file names. Fix it"),
-    "nothing held out": (top(train_filenames=TWO), r"names no view to judge by that is there: every 8th"),
-    "a shear": (top(applied_transform=SHEARED), r"applied_transform must turn, move and scale alike along all axes"),
+    "nothing held out": (top(train_filenames=TWO), r"lists no held-out view that exists: every 8th"),
+    "a shear": (
+        top(applied_transform=SHEARED),
+        r"applied_transform must be a rotation, a shift and the same scale along all axes",
+    ),
     "words": (top(applied_transform="none"), r"applied_transform is not a 4 x 4 matrix of numbers"),
     "a scale of zero": (top(applied_scale=0.0), r"applied_scale is 0, but it must be above 0"),
     "tiny units": (top(applied_scale=1e18), r"in a frame whose unit is 4.6.*e-18 .* applied_scale"),
@@ -178,7 +187,7 @@ LLFF = {
         rows(lambda old: np.where(np.isin(np.arange(17), [0, 5, 10]), -old, old)),
         r"not a rotation and",
     ),
-    "sides exchanged": (cell(EVERY, [4, 9], [16, 12]), r"16 x 12 pixels, but .* for 12 x 16: .*turned or stretched"),
+    "sides exchanged": (cell(EVERY, [4, 9], [16, 12]), r"16 x 12 pixels, but .* for 12 x 16: .*rotated or stretched"),
     "no photographs": (
         lambda root: (root / "images").rename(root / "pictures"),
         r"has no photographs in images, .* the folder itself",
@@ -187,7 +196,7 @@ LLFF = {
         cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]),
         r"All 9 cameras of \S+poses_bounds.npy are at the same position",
     ),
-    "one view": (first_alone, r"Holding out views from 1 leaves 0 to learn from and 1 to judge by"),
+    "one view": (first_alone, r"Holding out views from 1 leaves 0 for training and 1 for evaluation"),
 }
 
 
@@ -244,14 +253,14 @@ COLMAP = {
     "an empty model": (emptied, r"has no registered photograph, so nothing can be learned. Copy the model again, or"),
     "a tail": (
         text(IMAGES, lambda old: old + b"tail"),
-        r"images.bin cannot be read \(ValueError: it announces \S+ bytes, and has",
+        r"images.bin cannot be read \(ValueError: it claims \S+ bytes, but has",
     ),
     "files exchanged": (exchanged, r"(cameras|images).bin (cannot be read|holds)"),
     "more announced": (
         text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]),
-        r"images.bin .*announces \S+ entries",
+        r"images.bin .*claims \S+ entries",
     ),
-    "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin .*announces \S+ bytes"),
+    "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin .*claims \S+ bytes"),
     "a name that is no text": (
         swap(b"p_0.png", b"\xffp_0.png"),
         r"images.bin cannot be read \(UnicodeDecodeError: 'utf-8",
@@ -261,7 +270,7 @@ COLMAP = {
     "a camera twice": (cameras(1, *PINHOLE, views=(7, 7)), r"cameras.bin holds 7 more than once"),
     "unlisted cameras": (
         cameras(1, *PINHOLE, views=(1,)),
-        r"names a camera that is not there: 2\. .* 8 of the 9 views",
+        r"names a camera that does not exist: 2\. .* 8 of the 9 views",
     ),
     "a point with NaN": (point(np.nan), FAR_POINT),
     "a point beyond float32": (point(1e300), FAR_POINT),
@@ -405,7 +414,7 @@ LLFF_WALL, JSON_WALL = (
     lambda root, write=write: write(root, Known(c2w=wall())) for write in (write_llff, write_transforms)
 )
 SETTINGS = [
-    ("transforms", None, {"masks_keep": "black"}, r"masks_keep=black, and no photograph of .* has a mask. Say where"),
+    ("transforms", None, {"masks_keep": "black"}, r"masks_keep=black, but no photograph of .* has a mask. Name their"),
     ("transforms", None, {"masks": "images/x"}, r"masks=images/x holds no mask for any photograph of "),
     ("transforms", None, {"file": "absent/transforms.json"}, r"does not exist; the folder holds nothing that can be"),
     ("transforms", None, {"file": "x" * 5000}, r"does not exist; the folder holds images"),
@@ -418,11 +427,11 @@ SETTINGS = [
     ("colmap", None, {"near": 5.0, "far": 2.0}, r"scene.near=5.0 and scene.far=2.0: rays need 0 <= near < far"),
     ("colmap", None, {"near": float("nan")}, r"scene.near=nan .*rays need 0 <= near < far"),
     ("colmap", None, {"near": 1000.0}, r"scene.near=1000 lies behind all content of \S+sparse/0, which ends at"),
-    ("colmap", None, {"hold_every": 1}, r"scene.hold_every=1 would leave nothing to learn from: give 2 or more"),
+    ("colmap", None, {"hold_every": 1}, r"scene.hold_every=1 would leave no training views: give 2 or more"),
     ("colmap", None, {"background": "pink"}, r"scene.background is 'pink'; choose one of"),
     ("llff", None, {"space": "ndc"}, r"ndc needs cameras that all look the same way, .*scene.space=contracted"),
     ("transforms", JSON_WALL, {"space": "ndc"}, r"scene.space=ndc needs the depth at which content begins,"),
-    ("llff", LLFF_WALL, {"far": 9.0}, r"scene.far=9 cannot be kept with scene.space=ndc, which reaches to infinity"),
+    ("llff", LLFF_WALL, {"far": 9.0}, r"scene.far=9 cannot be used with scene.space=ndc, which reaches to infinity"),
     ("llff", ahead, {}, r"the view p_4.png .* stands 2.\d+ ahead of the cameras' middle, behind the near plane"),
 ]
 

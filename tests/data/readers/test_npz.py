@@ -75,8 +75,8 @@ def test_downscale_moves_every_projected_point_with_the_pixels(path):
         ({"near": 7.0}, r"scene.near is 7.0 and scene.far is 6.0"),
         ({"background": "grey"}, r"scene.background is 'grey'"),
         ({"hold_every": -2}, r"scene.hold_every is -2, but it must be 0"),
-        ({"hold_every": 1}, r"leaves 0 to learn from and 10 to judge by"),
-        ({"train_fraction": 1.0}, r"leaves 10 to learn from and 0 to judge by"),
+        ({"hold_every": 1}, r"leaves 0 for training and 10 for evaluation"),
+        ({"train_fraction": 1.0}, r"leaves 10 for training and 0 for evaluation"),
         ({"aabb_half": -1.0}, r"scene.aabb_half is -1.0"),
     ],
 )

@@ -38,8 +38,8 @@ def cut(lines):
 @pytest.mark.parametrize(
     ("form", "change", "message"),
     [
-        ("binary_little_endian", lambda c: c[:-40], r"is cut short: it announces 60 points"),
-        ("ascii", cut(5), r"is cut short: it announces 60 points"),
+        ("binary_little_endian", lambda c: c[:-40], r"is cut short: it claims 60 points"),
+        ("ascii", cut(5), r"is cut short: it claims 60 points"),
         ("ascii", lambda c: c.replace(b"0.", b"no.", 1), r"p.ply cannot be read \(ValueError"),
         ("ascii", lambda c: c.replace(b"float x", b"list uchar int x"), r"vertices with lists or unknown types"),
         ("ascii", lambda c: c.replace(b"float x", b"half x"), r"vertices with lists or unknown types"),

@@ -48,7 +48,7 @@ def test_cameras_are_found_once_and_again_where_a_photograph_has_changed(photogr
     assert first.view_names == second.view_names
     assert found == [photographs]
     assert "cameras: found 3 of 5, with an error of 0.50 pixels" in caplog.text
-    assert "cameras: d fit together and not to the rest: if they show another place" in caplog.text
+    assert "cameras: d fit together but not with the rest: if they show another place" in caplog.text
     assert "few were registered: take more photographs" in caplog.text
     changed = sorted(photographs.iterdir())[0]
     Image.fromarray(np.zeros(np.asarray(Image.open(changed)).shape, np.uint8)).save(changed)

@@ -76,7 +76,7 @@ def test_about_a_hundred_frames_are_left():
 def test_what_is_not_a_video_is_named(tmp_path):
     path = tmp_path / "notes.mp4"
     path.write_text("no film\n" * 100)
-    with pytest.raises(InputError, match=r"notes\.mp4 is not a video that is read here: mp4.*Convert it"):
+    with pytest.raises(InputError, match=r"notes\.mp4 is not in a supported video format \(mp4.*Convert it"):
         count_frames(path)
     with pytest.raises(InputError, match="is not a video that ffmpeg can read"):
         write_sharp_frames(path, tmp_path, every=2)

@@ -41,5 +41,5 @@ def test_is_one_paragraph(tmp_path, capture, what, first):
     assert "Traceback" not in errors
     assert "Exception in thread" not in errors
     (paragraph,) = [line for line in errors.splitlines() if line.startswith("nerf: ")]
-    assert "No space left on device. See that the place exists, can be written, and has space left." in paragraph
+    assert "No space left on device. Check that the folder exists, is writable, and has free space." in paragraph
     assert errors.splitlines()[-1] == paragraph

@@ -57,7 +57,7 @@ def test_a_driver_that_is_too_old_is_named(monkeypatch, caplog):
         devices.choose_device("gpu")
     assert f"here. {old}. Use trainer=cpu" in str(refused.value)
     assert devices.choose_device("auto") == ("cpu", "no GPU found")
-    assert caplog.messages == [f"The CPU computes, since torch cannot use the GPU here: {old}."]
+    assert caplog.messages == [f"Using the CPU, because torch cannot use the GPU here: {old}."]
 
 
 def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_name(monkeypatch):
@@ -87,7 +87,7 @@ def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_nam
 def test_a_machine_that_runs_out_of_memory_ends_with_one_paragraph(error, reason):
     told = paragraph(error, "train")
     assert told is not None
-    assert told.startswith(f"There is no memory for this: {reason}. Use a smaller model")
+    assert told.startswith(f"Not enough memory: {reason}. Use a smaller model")
     assert "\n" not in told
     assert paragraph(RuntimeError("a mistake of ours"), "train") is None
 
@@ -155,7 +155,7 @@ def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
-    asked = ("bf16-mixed", "as the run began") if begun else devices.choose_precision("bf16-mixed", "cuda")
+    asked = ("bf16-mixed", "as when the run started") if begun else devices.choose_precision("bf16-mixed", "cuda")
     assert devices.suited(*asked, "cuda", tiny_model())[0] == used
     said = ["trainer.precision=bf16-mixed: this device has no native bfloat16, so float32 is used instead."]
     assert caplog.messages == ([] if native or begun else said)

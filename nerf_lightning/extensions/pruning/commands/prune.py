@@ -66,7 +66,7 @@ def run(config: DictConfig) -> float | None:
         if tuning is not None and (run / "run.json").exists():
             going_on = f"{to_type('resume', str(run))} {to_type('init_from', str(target))}"
             raise InputError(
-                f"{run} holds a fine-tuning already. Go on with that one with nerf train {going_on}, or give another "
+                f"{run} already contains a fine-tuning run. Resume it with nerf train {going_on}, or give another "
                 "folder with paths.output_dir=DIR."
             )
         write_checkpoint(_content(narrow, quantized), target)

@@ -109,9 +109,9 @@ def test_a_run_is_pruned_packed_and_trained_on(nerf, stopped_fast, tmp_path):
 def test_bad_input_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):
     tiny = write_checkpoint(tmp_path / "tiny.ckpt")
     for setting, *words in (
-        ("keep=0", "keep=0: give the share of neurons that stay, above 0"),
+        ("keep=0", "keep=0: give the share of neurons to keep, above 0"),
         ("keep=0.01", "keep=0.01 leaves 0.32 of the 32 neurons", "nothing. Give keep=0.5 or more"),
-        ("by=luck", "by=luck does not fit: it must be importance, coreset, random, activation"),
+        ("by=luck", "by=luck is not valid: it must be importance, coreset, random, activation"),
         ("tables=int8", "tables=int8: this model has no hash tables"),
         ("finetune_steps=5", "has no .hydra/overrides.yaml", "init_from=CHECKPOINT"),
     ):
