@@ -34,7 +34,7 @@ HARMONICS: dict[Space, dict[Quality, int]] = {
     "ndc": {"small": 4, "medium": 4, "large": 9},
     "contracted": {"small": 4, "medium": 9, "large": 9},
 }
-BAKING = {"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0}
+BAKING = {"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colors": 15.0}
 COSTS = BAKING | {"fitted": 20.0, "measured": 8.0}
 
 
@@ -48,13 +48,13 @@ class PageExport(Export):
             the side of the box, and as many around it. None: as the quality.
         photographs: maximum number of photographs to jump to, spread over all; 0: none.
         max_views: maximum number of test views on which the page is compared with the model; 0: none.
-        fit_steps: steps that fit the voxels to the training photographs; 0: as baked, as also without photographs, or
-            if the model has a correction per photograph.
+        fit_steps: steps that fit the voxels to the training photographs; 0: none, as without photographs or with a
+            correction per photograph.
         title: title of the page; None: the scene's name, or its folder's if the name is only that of its format.
         views: file of named views, notes and distances (see `page_marks`), which is kept as `views.json` next to the
             page; None: that file, if it exists.
-        first_view: name of the view or photograph that is shown first; None: the training photograph nearest to the
-            average of all.
+        first_view: name of the view or photograph that is shown first; None: the most central training
+            photograph.
     """
 
     needs_photographs = True

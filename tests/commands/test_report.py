@@ -124,7 +124,7 @@ def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
 
 
 def test_what_is_no_run_is_refused(nerf, tmp_path):
-    said(nerf("report", tmp_path), "no run in it")
+    said(nerf("report", tmp_path), "is not a run folder")
     said(nerf("report"), "nerf report needs a run")
     said(nerf("report", tmp_path, tmp_path / "b"), "takes one folder")
     said(nerf("report", leave_measured_run(tmp_path / "run"), "measured=twice"), "measured=twice")

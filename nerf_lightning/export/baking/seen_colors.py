@@ -134,7 +134,7 @@ def fitted_colors(
         weighted = (basis * weight[..., None]).mT
         left = weighted @ basis + ridge * weight.sum(dim=1)[:, None, None]
         fitted[part] = torch.linalg.solve(left, weighted @ rgb.view(*chosen.shape, 3))
-        report("colours", part.stop / len(places))
+        report("colors", part.stop / len(places))
     return sharpened(fitted, seen.voxels, grid.optical.shape)
 
 

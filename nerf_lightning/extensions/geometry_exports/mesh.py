@@ -42,7 +42,7 @@ Surface = Literal["density", "tsdf"]
 BYTES_PER_POINT = {"density": density_mesh.BYTES_PER_POINT, "tsdf": fused_mesh.BYTES_PER_POINT}
 # A guess at how the time is shared; the bar corrects itself.
 COSTS = {"density": {"density": 6.0, "surface": 2.0, "views": 6.0}, "tsdf": {"depth": 12.0, "surface": 2.0}}
-COLORING = {False: {"colours": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
+COLORING = {False: {"colors": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
 REACH = 2.0  # In cells: so far the surface may be off to each side.
 # Most faces of a mesh with a texture, where nobody says how many: the charts of more take minutes.
 TEXTURED_FACES = 60_000
@@ -61,7 +61,7 @@ class MeshExport(Export):
         threshold: with `density`: the density at the surface, per scene unit; None: where rendering sees it
             (`surface_level`).
         truncation: with `tsdf`: the distance in front of and behind a surface within which views are averaged, in
-            cells. More is smoother, less keeps thin parts.
+            cells. Larger values are smoother; smaller ones keep thin parts.
         colors: the color of a vertex: as seen from the nearest cameras, or along the surface's normal.
         min_share: connected parts with fewer faces than this share of the largest one are removed as floaters.
         seen_only: remove what no training view sees, mainly interior surfaces; otherwise the mesh is closed.

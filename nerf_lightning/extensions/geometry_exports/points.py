@@ -50,8 +50,8 @@ class PointsExport(Export):
         min_opacity: minimum opacity of a pixel.
         agreement: how many of the 8 nearest views must see the same surface.
         tolerance: maximum relative difference of their depths.
-        format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without, which
-            needs `pip install 'nerf-lightning[las]'`.
+        format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without
+            normals, which needs `pip install 'nerf-lightning[las]'`.
     """
 
     num_points: int = 1_000_000

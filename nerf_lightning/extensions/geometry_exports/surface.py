@@ -89,7 +89,7 @@ def surface_colors(
         ways, here = looks.to(device), at.to(device)
         rgb = [short_rays(model, here, look, reach, reach, SAMPLES, closed=True).rgb for look in ways]
         colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
-        report("colours", part.stop / max(1, len(points)))
+        report("colors", part.stop / max(1, len(points)))
     return colors
 
 

@@ -24,7 +24,7 @@ from nerf_lightning.visualization.pictures import to_bytes
 
 BYTES_PER_POINT = 12  # Density, color, and the density again in the user's units.
 LEAST_ALPHA = 1e-3  # A cell less opaque than this has no color.
-COSTS = {"density": 2.0, "colours": 3.0}
+COSTS = {"density": 2.0, "colors": 3.0}
 
 
 @dataclass
@@ -85,7 +85,7 @@ def _colors(
         points = lattice.points(chunk)[kept]
         parts = [_seen(model, points[part], eyes) for part in tiles(len(points), tile_points)]
         rgb[chunk.start + kept.numpy()] = torch.cat(parts).numpy()
-        report("colours", chunk.stop / lattice.num_points)
+        report("colors", chunk.stop / lattice.num_points)
     return rgb.reshape(*lattice.shape, 3)
 
 

@@ -28,7 +28,7 @@ class HybridEncoder(ConeEncoder):
     Args:
         coarse: features of the coarse scales, gamma.
         fine: hash grid of the fine scales, h; None: there is none.
-        factor: the factor of the coarse features: `learnt` as above; `one` leaves them unchanged.
+        factor: the factor of the coarse features: `learnt`, as above, or `one`, which leaves them unchanged.
         width: width of the two hidden layers of the factor's MLP.
         cones: whether the factor also depends on the covariance of the pixel's cone, in squares of the grid's finest
             cell.

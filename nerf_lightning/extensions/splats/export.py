@@ -41,16 +41,17 @@ class SplatsExport(Export):
     """Write `splats.ply`, `.spz` or `.glb`, `splats.json` with what was measured, and `splats.png` to look at.
 
     Args:
-        num_splats: at most so many; auto: 200 for each pixel of a view's side, at most 150,000.
-        seconds: of fitting to the training photographs; without them, or where the model has a correction for each
-            camera, to pictures of the field; 0: as they lie on the field's surfaces.
-        sh_degree: of the spherical harmonics of colors, 0 to 3.
-        format: of the file. SPZ needs `pip install 'nerf-lightning[splats]'`.
-        frame: upright, turned until what is up is up in viewers; capture: the capture's own axes (GLB is always
+        num_splats: maximum number of splats; auto: 200 per pixel of a view's side, at most 150,000.
+        seconds: seconds of fitting to the training photographs; without them, or if the model has a correction per
+            photograph, to renders of the field; 0: no fitting.
+        sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
+        format: the file format: ply, spz (a sixth of the size) or glb (glTF with KHR_gaussian_splatting). SPZ needs
+            `pip install 'nerf-lightning[splats]'`.
+        frame: upright, so that the scene is upright in viewers, or capture, the capture's own axes (GLB is always
             upright).
-        longest: pixels of the longer side of the pictures that are fitted to, at most.
-        max_views: most held-out views that splats and field are compared on.
-        seed: of the splats that are drawn, and of the order of views.
+        longest: maximum length of the longer side of the images used for fitting, in pixels.
+        max_views: maximum number of held-out views on which splats and field are compared.
+        seed: the seed of the initial splats and of the order of views.
     """
 
     needs_photographs = True
