@@ -40,7 +40,7 @@ def run(config: DictConfig) -> None:
     settings: TrainerSettings = build(config.trainer)
     if settings.device_type not in DEVICES:
         raise InputError(
-            f"nerf selftest knows CPUs and NVIDIA GPUs, and trainer.accelerator chose {settings.device_type}. Use "
+            f"nerf selftest supports CPUs and NVIDIA GPUs, but trainer.accelerator chose {settings.device_type}. Use "
             "trainer=cpu; for TPUs there is make test-xla."
         )
     settings.prepare_machine()

@@ -44,7 +44,7 @@ class ComputeSettings:
         if num_threads is not None and not 1 <= num_threads <= MOST_THREADS:
             raise InputError(f"trainer.num_threads={num_threads}: give a number from 1 to {MOST_THREADS}, or null.")
         if isinstance(tile_points, int) and tile_points < 1:
-            raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
+            raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto or null.")
         self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         self._chosen = choose_precision(precision, self.device_type)
         self.precision, self.reason = self._chosen

@@ -76,7 +76,7 @@ def upright(evidence: Given) -> Check:
         cure = "Training is not affected. For upright pictures, rotate the photographs and estimate the poses again."
         return look(f"{100 * sideways:.0f} % of the photographs lie on their side", cure)
     if float(up_up.median()) < -0.1:
-        cure = "Turn the world so that up is +z (or check the axes); else videos and orbits are upside down."
+        cure = "Rotate the world so that up is +z (or check the axes); otherwise videos and orbits are upside down."
         return look("most photographs are upside down: up is not +z", cure)
     return ok("the photographs are upright")
 

@@ -106,7 +106,7 @@ def scale(evidence: Evidence) -> Check:
     message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
     if bool(inside.float().mean() > 0.3):
         cure = "Make the scene larger than the box or the box smaller (scene.aabb_half), or use scene.space=contracted."
-        return wrong(message + ": they stand within it", cure)
+        return wrong(message + ": they are inside it", cure)
     if away > 30 * half:
         cure = "Scale the camera centers down, or make the box larger (scene.aabb_half), with near and far to match."
         return wrong(message + ": the content would be a dot in their pictures", cure)

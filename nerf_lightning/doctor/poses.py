@@ -112,7 +112,7 @@ def single_poses(evidence: Evidence) -> Check:
     others = [view for view in range(len(c2w)) if view not in bad]
     doubted = [view for view in bad if not is_vouched_for(evidence, view, others)]
     if not doubted:
-        return ok(f"{found}; {evidence.named(bad)} agree with the views that stand nearest")
+        return ok(f"{found}; {evidence.named(bad)} agree with the nearest views")
     better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(evidence, view, bad))]
     if not better:
         message = f"few details that {evidence.named(doubted)} share with others lie where the cameras say"

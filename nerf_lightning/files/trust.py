@@ -29,7 +29,7 @@ from nerf_lightning.messages.errors import InputError
 
 MOST = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
 RECORDED = (torch.float32, torch.int64, torch.uint8)  # Types of tensors with annotated shapes
-CURE = "It was damaged or made by somebody else: use another one."
+CURE = "It is damaged, or was made by somebody else: use another one."
 
 
 class Mismatch(ValueError):
@@ -47,7 +47,7 @@ def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
     except InputError:
         raise
     except Mismatch as problem:
-        raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {cure}") from problem
+        raise InputError(f"{path} is damaged, or was made by somebody else: {problem}. {cure}") from problem
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path} cannot be read ({type(error).__name__}: {reason}). {cure}") from error

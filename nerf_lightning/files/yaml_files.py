@@ -15,7 +15,7 @@ from nerf_lightning.messages.errors import InputError
 
 MOST_DEPTH, MOST_BITS = 50, 1000
 """Brackets within brackets; bits of a whole number: larger ones are no floating-point numbers."""
-CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
+CURE = "It is damaged, or was made by somebody else: use another run folder or checkpoint."
 
 
 class _PlainLoader(yaml.SafeLoader):

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
-ANOTHER = "The checkpoint is damaged, or made by somebody else: use another one."
+ANOTHER = "The checkpoint is damaged, or was made by somebody else: use another one."
 """The cure of a state that no run can have left."""
 
 

@@ -96,7 +96,7 @@ class StepwiseRun(Run):
             if self.system.step.progress.rays_seen:
                 raise InputError(
                     "Lightning's Trainer has trained this run, and has its optimizer: save it with "
-                    "trainer.save_checkpoint(FILE), and go on with build_run(..., resume=FILE)."
+                    "trainer.save_checkpoint(FILE), and continue with build_run(..., resume=FILE)."
                 )
             self.system.to(self.settings.device)
             self._optimizer = self.system.step.new_optimizer()

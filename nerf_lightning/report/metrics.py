@@ -105,7 +105,7 @@ def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
 
 def _plain(name: str) -> str:
     if name != Path(name).name or name in ("", "..") or "\\" in name or "\0" in name:
-        raise InputError("its name is no plain file name")
+        raise InputError("its name is not a plain file name")
     return name
 
 

@@ -107,7 +107,7 @@ def _add_exports(report: Report, exported: Path, folder: Path) -> None:
 
 def _add_measured(report: Report, run: Path, file: Path) -> None:
     metrics, note = read_json_object(file), read_note(run)
-    report.subtitle = f"{run.absolute()}, begun {note.get('started', 'at an unknown time')}"
+    report.subtitle = f"{run.absolute()}, started {note.get('started', 'at an unknown time')}"
     report.facts = facts(metrics, note)
     report.columns, report.per_image = per_image(metrics)
     report.tables = tables(metrics)

@@ -141,8 +141,8 @@ class FilmFrames:
         except InputError as error:
             there = sum(map(self._is_there, range(self.count)))
             raise InputError(
-                f"{error} {there} of {self.count} frames are kept in {self.root}: the same command, given again, goes "
-                "on with the missing ones."
+                f"{error} {there} of {self.count} frames are kept in {self.root}: run the same command again to render "
+                "the missing ones."
             ) from error
 
 

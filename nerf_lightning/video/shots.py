@@ -239,8 +239,8 @@ def _check_outside(cameras: Cameras, clip: Clip | None) -> None:
     inside = clip.box.holds(cameras.c2w[:, :, 3]).nonzero().flatten().tolist()
     if inside:
         raise InputError(
-            f"crop: the camera of frame {inside[0]} stands inside the box ({len(inside)} of {len(cameras.c2w)} frames "
-            "do). Make the box smaller, or move the path away (for instance path=orbit path.radius=...)."
+            f"crop: the camera of frame {inside[0]} is in the box ({len(inside)} of {len(cameras.c2w)} frames are). "
+            "Make the box smaller, or move the path away (for instance path=orbit path.radius=...)."
         )
 
 

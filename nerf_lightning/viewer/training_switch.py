@@ -81,7 +81,9 @@ class TrainingPanel:
         gui, harmless = session.client.gui, session.queue.errors.harmless
         with gui.add_folder("Training"):
             self.said = gui.add_markdown("")
-            self.hold = gui.add_button(PAUSE, visible=switch.can_pause, hint="No step is taken until somebody lets it")
+            self.hold = gui.add_button(
+                PAUSE, visible=switch.can_pause, hint="Training waits until somebody presses Go on"
+            )
             self.end = gui.add_button(STOP, color="gray", hint=WHAT_STOP_IS)
         self.hold.on_click(harmless(lambda _: switch.go_on() if switch.wants_pause else switch.pause()))
         self.end.on_click(harmless(lambda _: self._stop()))

@@ -47,7 +47,7 @@ def test_what_no_training_refines_is_refused(tmp_path):
         r"refined\.lens_model": {"lens_model": "squinting"},
     }
     for said, changed in wrong.items():
-        with pytest.raises(InputError, match=f"is damaged, or made by somebody else: .*{said}"):
+        with pytest.raises(InputError, match=f"is damaged, or was made by somebody else: .*{said}"):
             read_checkpoint(saved(tmp_path, **changed))
 
 

@@ -49,7 +49,7 @@ def test_other_devices_are_refused_in_one_paragraph(nerf, monkeypatch):
     monkeypatch.setattr(selftest, "DEVICES", ())
     result = nerf("selftest", "trainer=cpu")
     assert result.code == 2
-    assert "nerf selftest knows CPUs and NVIDIA GPUs" in result.err
+    assert "nerf selftest supports CPUs and NVIDIA GPUs" in result.err
 
 
 @pytest.mark.exhaustive

@@ -125,7 +125,7 @@ def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     assert not (tmp_path / "out").exists()
     result, rows = table("force=true")
     assert len(ours(rows)) == 2
-    assert "Not all of these were measured alike" in result.out
+    assert "Not all of these were measured the same way" in result.out
     assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
 
 
@@ -175,7 +175,7 @@ def test_force_names_every_difference_once(table, tmp_path):
     result, _ = table("force=true")
     text = (tmp_path / "out" / "table.md").read_text()
     assert result.code == 0, result.err
-    notes = [line for line in text.splitlines() if "measured alike" in line]
+    notes = [line for line in text.splitlines() if "measured the same way" in line]
     assert [note.split(": ", 2)[2] for note in notes] == [
         "pixels: float and 8-bit.",
         "background: white and black.",

@@ -85,7 +85,7 @@ def test_known_depths_are_trained_on_with_a_grid_as_fine_as_the_pixels(caplog):
     # Cells of 4 / 2048 are as small as pixels of 1.5 / 576; those of 4 / 1024 are not.
     assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (2048, 19)
     assert "loss: depth, since the distance of 3 pixels is known" in caplog.text
-    assert "encoder: 2048 cells a side" in caplog.text
+    assert "encoder: 2048 cells per side" in caplog.text
 
 
 @pytest.mark.parametrize("scene", [IN_A_BOX, PHOTOGRAPHS])

@@ -146,7 +146,7 @@ def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
         ({"left_out": ("a.jpg", "b.jpg")}, "photographs without pose", "look", ("2 of 14", "a.jpg, b.jpg")),
         ({"left_out": tuple("abcdefghijklmnop")}, "photographs without pose", "look", ("16 of 28",)),
         ({"splits": {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}}, "split", "wrong", ("view 2.png",)),
-        ({"splits": {"train": (1, 2), "val": (0,), "test": (0,)}}, "number of views", "wrong", ("2 to learn",)),
+        ({"splits": {"train": (1, 2), "val": (0,), "test": (0,)}}, "number of views", "wrong", ("2 for training",)),
     ],
 )
 def test_what_the_scene_says_of_itself(changes, name, verdict, fragments):
@@ -224,7 +224,7 @@ def cropped(center):
         ("focal", lambda focal: 0.05 * focal, "field of view", "wrong", ""),
         ("focal", lambda focal: torch.tensor([1.0, 1.3]) * focal, "field of view", "look", "not square"),
         ("c2w", lambda c2w: rolled(c2w, 1), "upright", "look", "on their side"),
-        ("c2w", lambda c2w: rolled(c2w, 2), "upright", "look", "on their head"),
+        ("c2w", lambda c2w: rolled(c2w, 2), "upright", "look", "upside down"),
         ("c2w", lambda c2w: c2w * torch.tensor([1.0, 1, 1, 0]), "rotations", "wrong", "are at the same position"),
         ("c2w", lambda c2w: c2w * torch.tensor([-1.0, 1, 1, 1]), "rotations", "wrong", "not rotations"),
     ],

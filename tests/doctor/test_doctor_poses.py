@@ -48,7 +48,7 @@ def test_a_sound_capture_has_nothing_wrong():
         (inverted(c2w()), "axes", "look like world-to-camera rather", "Invert every pose matrix."),
         (inverted(axes(c2w(), (1.0, -1.0, -1.0))), "axes", "as COLMAP writes them", "Invert every pose matrix, then"),
         (transposed(c2w()), "axes", "rotations were transposed", "Transpose every rotation"),
-        (axes(c2w(), (-1.0, -1.0, 1.0)), "axes", "axes x and y of the cameras", "Negate columns 1 and 2"),
+        (axes(c2w(), (-1.0, -1.0, 1.0)), "axes", "cameras' x and y axes", "Negate columns 1 and 2"),
         (c2w().roll(1, 0), "order of photographs", "pose of the next one", "by one"),
         (c2w().roll(-1, 0), "order of photographs", "pose of the previous one", "by one"),
         (c2w().flip(0), "order of photographs", "reversed", "Reverse"),

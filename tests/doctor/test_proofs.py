@@ -43,7 +43,7 @@ def turned(degrees, view=VIEW):
 def test_a_pose_that_the_nearest_views_confirm_is_right_whatever_others_say():
     check = single_poses(with_mistaken_matches(corner_evidence()))
     assert check.verdict == "ok"
-    assert "view 5.png agree with the views that stand nearest" in check.message
+    assert "view 5.png agree with the nearest views" in check.message
 
 
 def test_matches_that_no_pose_explains_prove_nothing():

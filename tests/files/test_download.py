@@ -88,9 +88,9 @@ def test_two_at_a_time_fetch_once(server, target):
 
 def test_another_file_half_of_it_and_one_that_is_absent_are_told(server, target):
     refused(server.url, target, rf"its checksum is {SHA256}, not abc", sha256="abc")
-    refused(server.url, target, r"should have 99 bytes, and 100 came", num_bytes=99)
+    refused(server.url, target, r"should have 99 bytes, but 100 came", num_bytes=99)
     server.sends_at_most = 100_000
-    refused(server.url, target, r"should have 307200 bytes, and 100000 came|IncompleteRead")
+    refused(server.url, target, r"should have 307200 bytes, but 100000 came|IncompleteRead")
     server.status_for_all = 404
     refused(server.url, target, "HTTP Error 404: Not Found")
 

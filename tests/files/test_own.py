@@ -44,7 +44,7 @@ def test_a_folder_that_others_can_write_to_is_refused(tmp_path, shared):
     (tmp_path / "a").mkdir()
     (tmp_path / "a").chmod(shared)
     with pytest.raises(
-        InputError, match=rf"a can be written by others \(mode 0?{shared:o}\).*\(chmod 700 .*a'\); else"
+        InputError, match=rf"a can be written by others \(mode 0?{shared:o}\).*\(chmod 700 .*a'\); otherwise"
     ):
         make_own_folder(tmp_path / "a")
     (tmp_path / "a").chmod(0o755)
@@ -66,7 +66,9 @@ def test_files_of_others_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"link is a symbolic link"):
         open_own(tmp_path / "link", 100)
     path.chmod(0o666)
-    with pytest.raises(InputError, match=r"it can be written by others \(mode 0666\), so it may be a stranger's"):
+    with pytest.raises(
+        InputError, match=r"it can be written by others \(mode 0666\), so it may come from somebody else"
+    ):
         open_own(path, 100)
     path.chmod(0o600)
     belongs_to_another(path, monkeypatch)

@@ -29,7 +29,7 @@ def test_a_clicked_camera_is_the_one_in_the_list(tmp_path):
 def test_without_photographs_at_hand_it_is_said(tmp_path):
     panel = Panel(tmp_path)
     panel.set(CHOICE, "2: ball_2")
-    assert "its photograph is not at hand" in panel.controls.photographs.name.content
+    assert "its photograph is not available" in panel.controls.photographs.name.content
     assert not panel.gui.made[SPLIT].visible
 
 

@@ -67,7 +67,7 @@ class MemoryPlan:
 
         rows = [*self.rows, self.instead[0], *(replace(row, what=f"or {row.what}") for row in self.instead[1:])]
         lines = [line(row.what, row.num_bytes, row.where) for row in rows]
-        total = line("at most, beside what is held", self.total, f"{self.free / GIGABYTE:.1f} GB are free")
+        total = line("at most, in addition to what is held", self.total, f"{self.free / GIGABYTE:.1f} GB are free")
         return "\n".join(["memory plan:", *lines, total])
 
     @property

@@ -284,7 +284,7 @@ def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor,
 def model_for(scene: Scene) -> tuple[str, str]:
     """Return the model that suits a scene, as model=auto chooses it, and why."""
     if scene.space == "bounded":
-        return IN_A_BOX, "the scene stands in a box"
+        return IN_A_BOX, "the scene is in a box"
     return PHOTOGRAPHS, "the photographs show a background"
 
 

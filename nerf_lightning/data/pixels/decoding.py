@@ -216,7 +216,7 @@ def _mask(
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:
     """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbor."""
     if (pixels.shape[1], pixels.shape[0]) != size:
-        raise InputError(f"{path} changed while it was being read. Try again when it is complete.")
+        raise InputError(f"{path} changed while it was read. Try again when it is complete.")
 
 
 def photograph_hashes(pixels: PixelStore) -> Int[Tensor, "views"]:

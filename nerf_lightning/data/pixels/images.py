@@ -180,8 +180,8 @@ def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> B
     bright = [channel > KEEP_ABOVE for channel in said]
     if any((channel != bright[0]).any() for channel in bright[1:]):
         raise InputError(
-            f"The mask {path} has colors or transparent pixels, so which pixels it keeps is not clear. Save it as a "
-            f"gray picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
+            f"The mask {path} has colors or transparent pixels, so it is unclear which pixels it keeps. Save it as a "
+            f"grayscale picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
         )
     return bright[0] if keep == "white" else ~bright[0]
 

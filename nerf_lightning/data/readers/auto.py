@@ -96,7 +96,7 @@ class AutoReader(CaptureReader):
         """
         known = self._search()
         root = self.root if known.folder == self.folder() else str(known.folder)
-        log.info("%s: read as scene=%s, for it has %s", root, known.scene, known.file)
+        log.info("%s: read as scene=%s, because it has %s", root, known.scene, known.file)
         chosen = self._chosen() | {"root": root, "name": self.name}
         if not issubclass(known.reader, CaptureReader) and chosen.get("downscale") == "auto":
             del chosen["downscale"]  # of renderings, which are small

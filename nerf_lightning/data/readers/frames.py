@@ -66,8 +66,8 @@ class FrameFile:
         require_within("views", len(frames), str(path), "views")
         if content.get("from_mitsuba"):
             raise InputError(
-                f"{path} says from_mitsuba, and Mitsuba's cameras look along other axes than those of Blender and "
-                "nerfstudio. Negate the first and third columns of each transform_matrix, and remove it."
+                f"{path} says from_mitsuba, and Mitsuba's cameras use other axes than those of Blender and nerfstudio. "
+                "Negate the first and third columns of each transform_matrix, and remove it."
             )
         return cls(path, {key: value for key, value in content.items() if value is not None}, frames)
 

@@ -98,8 +98,8 @@ class LlffReader(CaptureReader):
         by_text, by_numbers = sorted(names), numeric_order(names)
         if by_text != by_numbers:
             log.warning(
-                "%s: the names of the photographs in text order (%s) and in numeric order (%s) differ, and the poses do"
-                " not say which was meant. Read in %s order; if renderings are blurred, try scene.order=%s",
+                "%s: the names of the photographs in text order (%s) and in numeric order (%s) differ, and the poses "
+                "do not show which was meant. Reading in %s order; if renderings are blurred, try scene.order=%s",
                 *(path, listed(by_text, 3), listed(by_numbers, 3)),
                 *(("text", "numbers") if self.order == "text" else ("numeric", "text")),
             )

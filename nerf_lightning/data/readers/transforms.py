@@ -168,7 +168,7 @@ def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, 
     if not is_there(path) or not (outside or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root))):
         path = root / path.name
     if not is_there(path):
-        log.warning("%s: the points of ply_file_path=%s are not there, and are left out", file.path, name)
+        log.warning("%s: the points of ply_file_path=%s are missing, and are left out", file.path, name)
         return none
     try:
         return torch.from_numpy(read_ply_points(path).positions)

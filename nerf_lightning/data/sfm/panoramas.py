@@ -59,12 +59,12 @@ def of_one_kind(photographs: Sequence[FoundPhotograph], panoramas: Panoramas, so
     taken = around if takes_panoramas else plain
     if len(taken) < FEWEST:
         raise InputError(
-            f"{source} holds {len(around)} panoramas of all directions, {len(unlike) - len(around)} of a part of them "
-            f"and {len(plain)} other photographs, and at least {FEWEST} of the first or the last are needed. Take more "
-            "of these, or read them all as plain photographs with panoramas=false."
+            f"{source} holds {len(around)} full panoramas, {len(unlike) - len(around)} partial ones and {len(plain)} "
+            f"other photographs, and at least {FEWEST} of the first or the last are needed. Take more of these, or "
+            "read them all as plain photographs with panoramas=false."
         )
     if left_out := sorted({*photographs} - {*taken}, key=lambda photograph: photograph.path):
-        why = "are no panoramas of all directions, and the others are" if takes_panoramas else "are panoramas"
+        why = "are not full panoramas, and the others are" if takes_panoramas else "are panoramas"
         others = not takes_panoramas and len(around) >= FEWEST
         log.warning(
             "%s: %d of %d pictures are left out, since they %s: %s.%s",

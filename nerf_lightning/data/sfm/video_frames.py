@@ -133,8 +133,8 @@ def _named(video: Path) -> Iterator[None]:
 
 def _not_a_video(path: Path) -> str:
     return (
-        f"{path} is not a video that ffmpeg can read, or it holds no frames. Play it to see whether it is whole, and "
-        "convert it to an mp4 (H.264) if it is."
+        f"{path} is not a video that ffmpeg can read, or it holds no frames. Play it to see whether it is complete, "
+        "and convert it to an mp4 (H.264) if it is."
     )
 
 

@@ -48,7 +48,7 @@ def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, rep
         f"Fitting {num_colored:,} voxels of {channels + 1} bytes (what.fit_steps={steps})",
         num_colored,
         lambda count: BYTES_PER_VALUE * (channels + 1) * count,
-        lambda count: f"what.fit_steps=0 leaves it out, and a smaller what.resolution, for {count:,} voxels,",
+        lambda count: f"what.fit_steps=0 skips it, and a smaller what.resolution, for {count:,} voxels,",
     )
     values, rays = _Values(baked), _TrainingRays(scene, views)
     for step in range(steps):

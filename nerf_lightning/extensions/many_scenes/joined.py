@@ -89,8 +89,8 @@ def _grouped(captures: Mapping[str, Scene], kind: Callable[[Scene], Kind]) -> di
 def _mixed(captures: Mapping[str, Scene], what: str, groups: Mapping[Kind, list[str]], cure: str) -> InputError:
     each = "; ".join(f"{kind}: {listed(names, 3)}" for kind, names in groups.items())
     return InputError(
-        f"{len(captures)} captures cannot be joined into one scene, for they differ in their {what} ({each}), which a "
-        f"scene has once. {cure}, or leave some of them out."
+        f"{len(captures)} captures cannot be joined into one scene, because they differ in their {what} ({each}), and "
+        f"a scene has only one. {cure}, or leave some of them out."
     )
 
 

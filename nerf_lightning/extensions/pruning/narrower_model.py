@@ -56,7 +56,7 @@ def _node(config: dict[str, Any], field: str, checkpoint: Checkpoint) -> dict[st
         node = node.get(name) if isinstance(node, dict) else None
     if not isinstance(node, dict) or not isinstance(node.get("width"), int):
         raise InputError(
-            f"The config in {checkpoint.path} has no model.{field}.width, which says how wide that field is, so that a "
-            "narrower one could not be built from the file. Pruning takes fields of the kind of nerf_mlp and ngp."
+            f"The config in {checkpoint.path} has no model.{field}.width, which says how wide that field is, so a "
+            "narrower one could not be built from the file. Pruning supports fields like nerf_mlp and ngp."
         )
     return node

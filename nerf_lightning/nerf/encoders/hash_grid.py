@@ -111,7 +111,7 @@ class HashGridEncoder(Encoder):
         if self.blend_in:
             weights = self.level_weights.tolist()
             if not all(0.0 <= weight <= 1.0 for weight in weights):
-                raise InputError(f"The weights of the levels in the encoder's state are no weights. {ANOTHER}")
+                raise InputError(f"The weights of the levels in the encoder's state are not valid. {ANOTHER}")
             self._set_weights(weights)
 
     def _set_weights(self, weights: list[float]) -> None:

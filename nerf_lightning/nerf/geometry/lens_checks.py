@@ -50,7 +50,7 @@ def _fault(cameras: Cameras, view: int) -> str | None:
     if not bool(torch.isfinite(lens).all()):
         return "has coefficients that are not finite"
     if model == "fisheye" and bool(lens[4:].any()):
-        return "has tangential coefficients p1, p2, which the model fisheye does not know"
+        return "has tangential coefficients p1, p2, which the fisheye model does not have"
     plane = image_plane(cameras, view)
     directions = unproject(plane, lens, model)
     angle, heading = off_axis(directions)

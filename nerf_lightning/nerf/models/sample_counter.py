@@ -66,7 +66,7 @@ class SampleCounter(nn.Module):
             InputError: negative counts, or a mean that cannot be.
         """
         if bool((self.counts < 0).any()) or not -1.0 <= float(self.mean) <= MOST_SAMPLES:
-            raise InputError(f"The samples per ray in the model's state are no counts. {ANOTHER}")
+            raise InputError(f"The samples per ray in the model's state are not valid counts. {ANOTHER}")
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)

@@ -86,7 +86,7 @@ class SE3Delta(Refinement):
         if (self.focal or self.lens) and scene.cameras.lens_model == "equirectangular":
             raise InputError(
                 f"refinement: the scene {scene.name} has panoramas, which have neither a focal length nor a lens. "
-                "Learn their poses alone, with refinement=se3, or choose refinement=none."
+                "Refine only their poses, with refinement=se3, or choose refinement=none."
             )
         photographs = len(scene.splits["train"])
         if photographs < FEWEST_PHOTOGRAPHS:

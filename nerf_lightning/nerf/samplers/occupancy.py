@@ -95,7 +95,7 @@ class OccupancySampler(RaggedSampler):
             raise InputError(
                 f"The photographs of {scene.name} show what lies far behind the content (space=contracted), and an "
                 "occupancy grid needs a box around all that is seen. Use model=fast_proposal (or model=auto), or give "
-                "scene.space=bounded if the content alone is wanted."
+                "scene.space=bounded if only the content matters."
             )
         self.grid.aabb.copy_(scene.aabb)
         self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
@@ -121,9 +121,9 @@ class OccupancySampler(RaggedSampler):
         inside = int(((eyes > scene.aabb[0]) & (eyes < scene.aabb[1])).all(dim=-1).sum())
         if inside:
             log.warning(
-                "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
-                "learned. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
-                "make the box smaller (scene.aabb_half).",
+                "%d of %d training cameras are inside the box of the scene %s: what lies outside it is not learned. If "
+                "the capture has no bounds, give scene.space=contracted if its reader supports it; otherwise make the "
+                "box smaller (scene.aabb_half).",
                 inside,
                 eyes.shape[0],
                 scene.name,

@@ -263,4 +263,4 @@ def test_kept_pixels_of_other_sizes_than_the_photographs(tmp_path, monkeypatch):
 
     root = WRITERS["transforms"](tmp_path / "capture")
     monkeypatch.setattr(capture_reader, "read_photographs", turned)
-    malformed.refused("transforms", root, "pixels that were kept of .* have other sizes than its photographs")
+    malformed.refused("transforms", root, "cached pixels of .* have other sizes than its photographs")

@@ -94,7 +94,7 @@ def test_masks_out_of_a_capture(tmp_path, secret, caplog, name):
     root = WRITERS["transforms"](tmp_path / "capture")
     edit_frame(root, 3, mask_path=name.replace("ABSOLUTE", str(secret / "p_3.png")))
     assert read("transforms", root).pixels.mask is None
-    assert "of 1 files (mask_path) 1 are not there" in caplog.text
+    assert "of 1 files (mask_path) 1 are missing" in caplog.text
     assert read("transforms", root, allow_outside=True).pixels.mask is not None
 
 
@@ -337,7 +337,7 @@ def test_a_planted_cache_is_not_believed(tmp_path, header, change):
 
 def test_a_cache_of_other_photographs_is_refused(tmp_path, header):
     header.write_text(json.dumps(json.loads(header.read_text()) | {"sizes": [[144, 12]]}))
-    with pytest.raises(InputError, match=r"holds 1 photographs where 9 belong.*Remove"):
+    with pytest.raises(InputError, match=r"holds 1 photographs instead of 9.*Remove"):
         read("colmap", tmp_path / "capture")
 
 
@@ -350,6 +350,6 @@ def test_links_in_the_place_of_a_lock_or_of_parts_are_not_followed(tmp_path, hea
     header.unlink()
     header.with_suffix(".lock").unlink(missing_ok=True)
     header.with_suffix(".lock").symlink_to(tmp_path / "victim")
-    with pytest.raises(InputError, match="cannot be kept in"):
+    with pytest.raises(InputError, match="cannot be cached in"):
         read("colmap", tmp_path / "capture")
     assert (tmp_path / "victim").read_text() == "precious"

@@ -314,13 +314,13 @@ def test_a_disk_that_fills_up_meanwhile_is_one_paragraph(capture, cache, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.Path, "touch", full)
-    with pytest.raises(InputError, match=r"cannot be kept in .*cache: No space left on device. Make room"):
+    with pytest.raises(InputError, match=r"cannot be cached in .*cache: No space left on device. Make room"):
         read(capture, cache)
 
 
 def test_a_folder_that_cannot_be_written_is_named(capture, tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match=r"cannot be kept in .*file.cache: .*scene.cache_dir"):
+    with pytest.raises(InputError, match=r"cannot be cached in .*file.cache: .*scene.cache_dir"):
         read(capture, tmp_path / "file" / "cache")
 
 

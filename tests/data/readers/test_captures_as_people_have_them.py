@@ -229,7 +229,7 @@ def test_masks_are_found_by_their_photographs_names(tmp_path, plain, write, name
     assert kept(scene) == 0.25
 
 
-@pytest.mark.parametrize(("there", "words"), [(8, r"1 of 9 photographs have no mask"), (0, r"9 are not there")])
+@pytest.mark.parametrize(("there", "words"), [(8, r"1 of 9 photographs have no mask"), (0, r"9 are missing")])
 def test_an_absent_mask_is_never_the_photograph_itself(tmp_path, plain, caplog, there, words):
     root = write_transforms(tmp_path / "c", KNOWN)
     each_frame(root, lambda frame: {"mask_path": frame["file_path"].replace("images", "masks")})

@@ -99,7 +99,10 @@ TRANSFORMS = {
         frame(2, transform_matrix=[[float("nan")] * 4] * 3),
         r"transform_matrix holds NaN or infinity: this view",
     ),
-    "a camera far away": (frame(0, transform_matrix=AT_THE_END), r"p_0.png has .*a center beyond 1e\+09, where no"),
+    "a camera far away": (
+        frame(0, transform_matrix=AT_THE_END),
+        r"p_0.png has .*a center beyond 1e\+09, where numbers",
+    ),
     "a frame twice": (frame(2, file_path="./images/p_1.png"), r"lists images/p_1.png more than once, with different p"),
     "fl_x of zero": (top(fl_x=0.0), r"the view images/p_0.png has the focal length 0, 20"),
     "intrinsics with NaN": (top(cx=float("nan")), r"the view images/p_0.png has a pose or intrinsics with NaN"),
@@ -248,7 +251,7 @@ COLMAP = {
         r"images.bin cannot be read \(FileNotFoundError",
     ),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
-    "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
+    "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not supported"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
     "an empty model": (emptied, r"has no registered photograph, so nothing can be learned. Copy the model again, or"),
     "a tail": (

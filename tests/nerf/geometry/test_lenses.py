@@ -273,7 +273,7 @@ def test_a_fisheye_that_would_see_more_than_everything():
 @pytest.mark.parametrize(
     ("lens", "model", "parts"),
     [
-        ([0.0, 0.0, 0.0, 0.0, 0.01, 0.0], "fisheye", ("p1, p2, which the model fisheye", "p1=0.01")),
+        ([0.0, 0.0, 0.0, 0.0, 0.01, 0.0], "fisheye", ("p1, p2, which the fisheye model", "p1=0.01")),
         ([math.nan, 0.0, 0.0, 0.0, 0.0, 0.0], "radial_tangential", ("has coefficients that are not finite",)),
         # The usual mistake with units: divided by nothing.
         ([-40.0, 12.0, 0.0, 0.0, 0.0, 0.0], "radial_tangential", ("for lengths in focal lengths, not in pixels",)),

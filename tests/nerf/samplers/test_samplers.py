@@ -252,7 +252,7 @@ def test_a_box_that_no_camera_sees_and_cameras_inside_of_it_are_said_by_name(cap
     with pytest.raises(InputError, match=r"box of the scene ball.*no camera sees it.*scene\.aabb_half"):
         a_sampler(replace(scene, aabb=scene.aabb + 500.0))
     a_sampler(replace(scene, aabb=5 * scene.aabb))
-    assert "3 of 3 training cameras stand inside the box of the scene ball" in caplog.text
+    assert "3 of 3 training cameras are inside the box of the scene ball" in caplog.text
     caplog.clear()
     a_sampler(scene)
     assert caplog.text == ""

@@ -40,7 +40,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     said(nerf(*given, "what.format=stl"), "what.format=stl is not valid", "ply, obj, glb")
     said(nerf(*given, "what.resolution=30000"), "what.resolution=30000", "GB", "would fit")
     empty = nerf(*given, "what.threshold=1e9", "what.resolution=32")
-    said(empty, "There is no surface", "go from", "1e+09")
+    said(empty, "There is no surface", "range from", "1e+09")
     assert not list(tmp_path.iterdir())
 
 

@@ -202,9 +202,9 @@ def test_content_that_leaves_a_bounded_box_is_closed_and_that_of_a_contracted_sc
 
 def test_an_empty_field_is_refused_with_the_densities_seen(tmp_path):
     thin = solid(ball(), inside=0.01)
-    with pytest.raises(InputError, match=r"densities of its box go from 0 to 0\.01.*sees anything opaque"):
+    with pytest.raises(InputError, match=r"densities in its box range from 0 to 0\.01.*sees anything opaque"):
         exported(tmp_path, thin, record())
-    with pytest.raises(InputError, match=r"where the density is 900: .* go from 0 to 400 .*what\.threshold="):
+    with pytest.raises(InputError, match=r"where the density is 900: .* range from 0 to 400 .*what\.threshold="):
         exported(tmp_path, solid(ball()), record(), threshold=900.0)
     assert not list(tmp_path.iterdir())
 
@@ -212,7 +212,9 @@ def test_an_empty_field_is_refused_with_the_densities_seen(tmp_path):
 def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch):
     memory = type("Memory", (), {"available": 1_000_000_000})
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
-    with pytest.raises(InputError, match=r"2049 x 2049 x 2049 points, which takes 68\.\d GB, and 0\.8 GB") as error:
+    with pytest.raises(
+        InputError, match=r"2049 x 2049 x 2049 points, which takes 68\.\d GB, but only 0\.8 GB"
+    ) as error:
         exported(tmp_path, solid(ball()), record(), resolution=2048)
     fitting = int(str(error.value).split("what.resolution=")[2].split(" ")[0])
     assert (fitting + 1) ** 3 <= 1e8 < (fitting + 2) ** 3

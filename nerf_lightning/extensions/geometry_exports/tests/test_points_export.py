@@ -124,7 +124,9 @@ def test_a_cloud_takes_no_more_memory_than_is_asked_for(tmp_path):
 def test_a_cloud_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10**6}))
     scene = scene_record(ball_scene(num_views=12, size=64))
-    with pytest.raises(InputError, match=r"what\.longest=400 makes 24,576 points of 6 views, .* can be had") as error:
+    with pytest.raises(
+        InputError, match=r"what\.longest=400 makes 24,576 points of 6 views, .* are available"
+    ) as error:
         PointsExport().export(solid(ball()), scene, tmp_path, TILE)
     longest = int(str(error.value).split("what.longest=")[2].split(" ")[0])
     assert 6 * longest**2 * (BYTES_PER_PIXEL + BYTES_PER_POINT) <= 8e5

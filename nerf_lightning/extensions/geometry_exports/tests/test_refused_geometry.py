@@ -56,7 +56,7 @@ def test_no_grid_is_laid_over_ndc_or_has_one_cell(tmp_path, exporter):
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        (VolumeExport(1024), r"12\.9 GB, and 0\.8 GB of memory can be had\. what\.resolution=\d+ would fit"),
+        (VolumeExport(1024), r"12\.9 GB, but only 0\.8 GB of memory are available\. what\.resolution=\d+ would fit"),
         (MeshExport(2048, "tsdf"), r"2049 x 2049 x 2049 points, which takes 103\.\d GB.*what\.resolution=\d+ would"),
         (MeshExport(texture=True, texture_size=8192), r"8192 x 8192 texels, which takes 6\.\d GB.*texture_size=\d+ w"),
     ],
@@ -91,7 +91,7 @@ def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, library
 
 def test_without_numba_a_fused_surface_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(layout, "backend", lambda module: None)
-    with pytest.raises(InputError, match=r"what\.surface=tsdf needs numba.*take what\.surface=density"):
+    with pytest.raises(InputError, match=r"what\.surface=tsdf needs numba.*use what\.surface=density"):
         exported(tmp_path, MeshExport(16, "tsdf"))
 
 

@@ -72,7 +72,7 @@ OTHERS = {
         ms(lambda xml: xml.replace("</f>", "</f><b2>1</b2>")),
         None,
         ALL,
-        r"has b2, which is not known",
+        r"has b2, which is not supported",
     ),
     "metashape in utf-16": (write_metashape, lambda root: files(root, "*.xml", to_utf_16), ALL, r"scene=metashape"),
 }
@@ -102,9 +102,9 @@ def test_neus_photographs_out_of_order_of_their_numbers_are_said(tmp_path, caplo
     [
         (lambda xml: xml[:-20], "", r"cameras\.xml cannot be read \(ParseError"),
         (lambda xml: xml.replace("<f>20.0", "<f>20,0"), "", r"holds '20,0' where numbers of a camera belong"),
-        (lambda xml: xml.replace("<document", "<!DOCTYPE a><document"), "", r"declares entities"),
-        (str, "<transform><rotation>1 0 0 0 1 0 0 0 -1</rotation></transform>", r"no rotation with a shift"),
-        (str, "<transform><rotation>1 0 0</rotation></transform>", r"no rotation with a shift"),
+        (lambda xml: xml.replace("<document", "<!DOCTYPE a><document"), "", r"declares XML entities"),
+        (str, "<transform><rotation>1 0 0 0 1 0 0 0 -1</rotation></transform>", r"is not a rotation, a shift"),
+        (str, "<transform><rotation>1 0 0</rotation></transform>", r"is not a rotation, a shift"),
     ],
 )
 def test_metashapes_faults_are_named_with_the_file(tmp_path, change, chunk, message):

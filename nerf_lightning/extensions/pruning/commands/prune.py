@@ -100,6 +100,6 @@ def _content(narrow: Checkpoint, quantized: dict[str, Any]) -> dict[str, Any]:
 def _sizes(wide: Checkpoint, target: Path) -> str:
     weights = sum(tensor.numel() * tensor.element_size() for tensor in wide.weights.values())
     return (
-        f"{target}  {target.stat().st_size / 1e6:.2f} MB; {wide.path.name} had {weights / 1e6:.2f} MB of weights, and "
-        f"{wide.path.stat().st_size / 1e6:.2f} MB with what training goes on from"
+        f"{target}  {target.stat().st_size / 1e6:.2f} MB; {wide.path.name} had {weights / 1e6:.2f} MB of weights, "
+        f"and {wide.path.stat().st_size / 1e6:.2f} MB with the state for resuming"
     )

@@ -103,7 +103,10 @@ def test_a_run_is_pruned_packed_and_trained_on(nerf, stopped_fast, tmp_path):
     assert weights["levels.fine.field.position_encoder.table"].dtype == torch.float32
     assert read_checkpoint(run).step == 2
     assert "field.width=8" in yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text())
-    said(nerf(*given, f"paths.output_dir={tmp_path}/small", "finetune_steps=2"), f"{run} holds a fine-tuning already")
+    said(
+        nerf(*given, f"paths.output_dir={tmp_path}/small", "finetune_steps=2"),
+        f"{run} already contains a fine-tuning run",
+    )
 
 
 def test_bad_input_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):

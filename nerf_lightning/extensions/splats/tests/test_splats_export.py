@@ -130,7 +130,7 @@ def test_normalised_device_coordinates_become_places_in_the_world(tmp_path):
 
 def test_panoramas_and_empty_fields_are_refused(tmp_path):
     around = ball_scene(lens_model="equirectangular")
-    with pytest.raises(InputError, match="ball is made of panoramas"):
+    with pytest.raises(InputError, match="ball consists of panoramas"):
         exported(tmp_path, solid(ball()), around)
     with pytest.raises(InputError, match=r"no surface to put splats on: the field's opacity is at most 0\.\d+"):
         exported(tmp_path, solid(ball(), inside=0.01), ball_scene(num_views=8, size=24))
