@@ -95,9 +95,13 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
 
 @pytest.mark.parametrize(
     ("model", "changes", "variants"),
-    [("nerf_tiny", ("data.batch_rays=48",), 1), ("fast_proposal", ("encoder.log2_table_size=10", *PROPOSALS), 2)],
+    [
+        ("nerf_tiny", ("data.batch_rays=48",), 1),
+        ("fast_proposal", ("encoder.log2_table_size=10", *PROPOSALS), 2),
+        ("fast_small", (*SMALL, "correction=exposure"), 1),
+    ],
 )
-def test_models_with_equally_many_samples_have_a_recording_for_each_variant_of_their_steps(model, changes, variants):
+def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
     run = trained([48] * 8, True, model, *changes)
     assert_same(run, trained([48] * 8, False, model, *changes))
     assert len(run.training._recorded.recordings) == variants

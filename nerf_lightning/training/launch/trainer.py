@@ -39,7 +39,7 @@ class TrainerSettings(ComputeSettings):
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
-            for refinement, correction and losses that learn. auto: where the run permits it, in one process.
+            for refinement and losses that learn. auto: where the run permits it, in one process.
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
