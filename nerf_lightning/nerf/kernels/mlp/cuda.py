@@ -26,7 +26,7 @@ FORWARD: dict[str, Any] = {"enable_fp_fusion": True}
 # fit into the registers.
 BACKWARD: dict[str, Any] = {"enable_fp_fusion": True, "num_stages": 1, "num_warps": 8}
 PROGRAMS = 4
-"""So many for each multiprocessor sum up the gradients of the weights, each for itself, in an order that is fixed. On an
+"""For each multiprocessor: each sums up gradients of the weights for itself, and the order of all sums is fixed. On an
 H100 four take two thirds of the time of two."""
 ELSEWHERE = 64
 """Multiprocessors that the interpreter makes believe."""
