@@ -106,7 +106,7 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
         (["near=7"], ["near=7 leaves nothing to see", "rays end at"]),
         (["crop=[[0,0,0]]"], ["crop=[[0, 0, 0]]", "lower and the upper corner"]),
         (["crop=[[0,0,0],[1,-1,1]]"], ["holds nothing", "smaller than"]),
-        (["crop=[[-9,-9,-9],[9,9,9]]"], ["the camera of frame 0 is inside the box (2 of 2 frames do)"]),
+        (["crop=[[-9,-9,-9],[9,9,9]]"], ["the camera of frame 0 is in the box (2 of 2 frames are)"]),
         (["crop=[[-1,-1,0],[1,1,1]]", "background=none"], ["crop: this model has no background", "background=white"]),
         (["projection=round"], ["projection=round: choose one of perspective, equirectangular"]),
         (["projection=equirectangular", "path.fov=60.0"], ["path.fov=60 with projection=equirectangular"]),

@@ -43,7 +43,7 @@ def test_the_environment_says_what_auto_means(native, monkeypatch):
         other = "32-true" if meant == "bf16-mixed" else "bf16-mixed"
         assert TrainerSettings(accelerator="cpu", precision=other).precision == other  # what is asked for is taken
     monkeypatch.setenv("NERF_LIGHTNING_PRECISION", "half")
-    with pytest.raises(InputError, match=r"NERF_LIGHTNING_PRECISION=half .* give one of auto, 32-true"):
+    with pytest.raises(InputError, match=r"NERF_LIGHTNING_PRECISION=half .* use one of auto, 32-true"):
         TrainerSettings(accelerator="cpu")
 
 
