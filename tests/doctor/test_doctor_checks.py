@@ -246,7 +246,7 @@ def test_cameras_that_look_away_are_wrong_without_any_detail():
     judged(evidence, "box in view", "wrong")
 
 
-@pytest.mark.parametrize(("factor", "says"), [(0.1, "within it"), (40.0, "a dot")])
+@pytest.mark.parametrize(("factor", "says"), [(0.1, "inside it"), (40.0, "a dot")])
 def test_a_capture_of_another_scale_than_its_box_is_wrong(factor, says):
     scene = ball_scene(10, 12)
     c2w = scene.cameras.c2w * torch.tensor([1.0, 1, 1, factor])

@@ -90,7 +90,7 @@ def test_a_full_disk_is_said_in_one_paragraph_and_the_frames_are_kept(tmp_path):
     each = frames(tmp_path)
     opened(each)
     with pytest.raises(
-        InputError, match=r"No space left.*2 of 4 frames are kept in .*goes on with the missing"
+        InputError, match=r"No space left.*2 of 4 frames are kept in .*same command again to render the missing"
     ) as said:
         each.save("video", 2, full)
     assert "\n" not in str(said.value)

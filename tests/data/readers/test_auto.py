@@ -24,7 +24,7 @@ def test_a_format_is_recognised_and_read_as_by_its_own_reader(tmp_path, caplog, 
     ours, theirs = AutoReader(root=str(tmp_path)).read(), read(kind, tmp_path)
     assert torch.equal(ours.cameras.c2w, theirs.cameras.c2w)
     assert ours.background == theirs.background
-    assert f"read as scene={kind}, for it has " in caplog.text
+    assert f"read as scene={kind}, because it has " in caplog.text
 
 
 def test_the_blender_format_keeps_its_own_defaults(tmp_path):

@@ -184,7 +184,7 @@ ROOTS = {
     "sparse/1 has more": (model("sparse/1", "images"), many_features, "", r"sparse/1 is read, of 2 models"),
     "flat": (model("", "", ".txt"), None, "", r"read as scene=colmap"),
     "undistorted": (model("distorted/sparse/0", "input"), None, "", r"read as scene=colmap"),
-    "the model given": (write_colmap, None, "c/sparse/0", r"c: read as scene=colmap, for it has sparse/0"),
+    "the model given": (write_colmap, None, "c/sparse/0", r"c: read as scene=colmap, because it has sparse/0"),
     "its file given": (write_colmap, None, "c/sparse/0/cameras.bin", r"c: read as scene=colmap"),
     "pictures given": (write_colmap, None, "c/images", r"c: read as scene=colmap"),
     "two above": (write_transforms, renamed("", "../d/a/b"), "d", r"d/a/b: read as scene=transforms"),

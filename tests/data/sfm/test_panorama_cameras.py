@@ -64,11 +64,11 @@ def test_what_was_decided_is_said_with_the_setting_that_changes_it(caplog):
     assert "3 of 6 pictures are left out, since they are panoramas: 3.jpg, 4.jpg, 5.jpg." in caplog.text
     assert "panoramas=true" in caplog.text
     taken("auto", PLAIN, *[(*WHOLE, "said")] * 3)
-    assert "1 of 4 pictures are left out, since they are no panoramas of all directions" in caplog.text
+    assert "1 of 4 pictures are left out, since they are not full panoramas" in caplog.text
 
 
 def test_too_few_of_one_kind_are_refused():
-    with pytest.raises(InputError, match=r"images=DIR holds 2 panoramas of all directions, 1 of a part of them and 1 "):
+    with pytest.raises(InputError, match=r"images=DIR holds 2 full panoramas, 1 partial ones and 1 "):
         taken("auto", (*WHOLE, "said"), WHOLE, (*PART, "said"), PLAIN)
     with pytest.raises(InputError, match=r"panoramas=true, but 1 of 3 pictures of images=DIR are twice as wide"):
         taken(True, WHOLE, PLAIN, PLAIN)
