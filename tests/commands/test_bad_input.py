@@ -144,7 +144,7 @@ def test_lpips_without_its_weights(nerf, last, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
-    process = start("render", f"ckpt={last}", "path.num_frames=500", "path.width=200", f"paths.output_dir={tmp_path}")
+    process = start("render", f"ckpt={last}", "path.num_frames=100", "path.width=40", f"paths.output_dir={tmp_path}")
     while process.poll() is None and not list(tmp_path.glob(".frames/*/*.png")):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)

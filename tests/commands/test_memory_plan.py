@@ -111,7 +111,7 @@ print(json.dumps([measured, plan.total, gaps]))
 @pytest.mark.parametrize(
     ("model", "precision", "threads", "overrides"),
     [
-        ("nerf_tiny", "bf16-mixed", 2, ["data.batch_rays=4096"]),
+        pytest.param("nerf_tiny", "bf16-mixed", 2, ["data.batch_rays=4096"], marks=pytest.mark.minutes),
         pytest.param("nerf_tiny", "bf16-mixed", 1, ["data.batch_rays=4096"], marks=pytest.mark.exhaustive),
         pytest.param("fast_proposal", "bf16-mixed", 1, [], marks=pytest.mark.exhaustive),
         pytest.param("nerf_tiny", "32-true", 2, ["data.batch_rays=4096"], marks=pytest.mark.exhaustive),

@@ -78,10 +78,7 @@ TRANSFORMS = {
         text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"),
         r"is not usable json: .*digits",
     ),
-    "a key twice": (
-        text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")),
-        r"key 'fl_x' stands twice",
-    ),
+    "a key twice": (text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")), r"key 'fl_x' stands twice"),
     "a thousand digits": (top(fl_x=10**1000), r"transforms.json: frames\[0\] .*: fl_x has too many digits"),
     "a camera path": (content(lambda _: PATH), r"lacks frames; it has camera_type, .* A transforms.json of"),
     "a list": (content(lambda old: old["frames"]), r"must be a json object with the keys frames, but it is list"),
@@ -234,10 +231,7 @@ PINHOLE = (20.0, 20.0, 8.0, 6.0)
 FAR_POINT = r"sparse/0: 1 of (1|60) sparse points are NaN or beyond 1e\+09, and are left out"
 COLMAP = {
     "no model": (lambda root: (root / "sparse").rename(root / ".sparse"), r"holds no COLMAP model: .* sparse, "),
-    "half a model": (
-        lambda root: (root / IMAGES).unlink(),
-        r"images.bin cannot be read \(FileNotFoundError",
-    ),
+    "half a model": (lambda root: (root / IMAGES).unlink(), r"images.bin cannot be read \(FileNotFoundError"),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not known"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
@@ -308,10 +302,7 @@ TEXT = {
         text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"),
         r"images.txt cannot be read \(UnicodeDecodeError",
     ),
-    "a point far away": (
-        lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)),
-        FAR_POINT,
-    ),
+    "a point far away": (lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)), FAR_POINT),
 }
 
 
