@@ -187,10 +187,7 @@ def test_no_plan_exceeds_what_is_known_without_a_trial(name):
 
 
 def plan(step, free, counts=True):
-    rows = [
-        Row("pixels", 3 * 10**9, "mapped file", counts),
-        Row("optimizer's state", 10**9, "memory", cure="shrink it"),
-    ]
+    rows = [Row("pixels", 3 * 10**9, "mapped file", counts), Row("optimizer", 10**9, "memory", cure="shrink it")]
     steps = [Row("a step", step, "memory", cure="lower trainer.tile_points"), Row("a picture", 10**9, "memory")]
     return MemoryPlan(rows, steps, free)
 

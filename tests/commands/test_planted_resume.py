@@ -95,9 +95,7 @@ def test_the_command_refuses_and_leaves_the_checkpoint(nerf, stopped, tmp_path):
     before = last.read_bytes()
     result = nerf("train", f"resume={run}", "trainer.max_steps=25")
     assert result.code == 2
-    assert result.err.splitlines()[-1].startswith(
-        f"nerf: {last} is damaged, or made by somebody else: optimizer_states"
-    )
+    assert result.err.splitlines()[-1].startswith(f"nerf: {last} is damaged, or made by somebody else: optimizer")
     assert "Traceback" not in result.err
     assert last.read_bytes() == before
 

@@ -74,10 +74,7 @@ JSON = "transforms.json"
 TRANSFORMS = {
     "no json": (lambda root: (root / JSON).unlink(), r"json does not exist; the folder holds images. Point scene.root"),
     "cut short": (text(JSON, lambda old: old[:-20]), r"json is not valid json: .* at line 1, column \d+. Export it"),
-    "ten thousand digits": (
-        text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"),
-        r"is not usable json: .*digits",
-    ),
+    "ten thousand digits": (text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"), r"not usable json: .*digits"),
     "a key twice": (text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")), r"key 'fl_x' stands twice"),
     "a thousand digits": (top(fl_x=10**1000), r"transforms.json: frames\[0\] .*: fl_x has too many digits"),
     "a camera path": (content(lambda _: PATH), r"lacks frames; it has camera_type, .* A transforms.json of"),
@@ -135,10 +132,6 @@ def cell(row, column, value):
     return rows(change)
 
 
-def pickled(root):
-    np.save(root / "poses_bounds.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-
-
 def archived(root):
     with (root / "poses_bounds.npy").open("wb") as file:
         np.savez(file, poses=np.zeros((9, 17)))
@@ -157,33 +150,22 @@ LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
     "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
-    "empty": (text(NPY, lambda old: b""), NO_ARRAY),
     "an archive": (archived, NO_ARRAY),
-    "pickled": (pickled, r"poses_bounds.npy cannot be read \(ValueError: Object arrays cannot be loaded"),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
     "a photograph missing": (lambda root: one_picture(root).unlink(), r"has 9 poses, but \S+images has 8 photographs"),
-    "a photograph too many": (
-        lambda root: write_pictures(root / "images", ("x.png",), (16, 12)),
-        r"has 10 photographs",
-    ),
+    "a photograph too many": (lambda root: write_pictures(root / "images", ("x.png",), (16, 12)), r"10 photographs"),
     "NaN in a pose": (cell(2, 3, np.nan), r"the view p_2.png has a pose or intrinsics with NaN or infinity"),
     "infinite depth": (cell(5, 16, np.inf), r"bounds.* are not used, since .* 1 of 9 .*p_5.png"),
     "bounds exchanged": (cell(4, 15, 100.0), r"bounds.* are not used, since .* 1 of 9 .*p_4.png"),
     "a bound far away": (cell(EVERY, 16, 1e12), r"the content .* would reach .* the cameras' distance from the middle"),
     "a focal length of zero": (cell(EVERY, 14, 0.0), r"the view p_0.png has the focal length 0, 0 for 16 x 12 pixels"),
-    "mirrored poses": (
-        rows(lambda old: np.where(np.isin(np.arange(17), [0, 5, 10]), -old, old)),
-        r"not a rotation and",
-    ),
+    "mirrored poses": (rows(lambda old: np.where(np.isin(np.arange(17), [0, 5, 10]), -old, old)), r"not a rotation"),
     "sides exchanged": (cell(EVERY, [4, 9], [16, 12]), r"16 x 12 pixels, but .* for 12 x 16: .*turned or stretched"),
     "no photographs": (
         lambda root: (root / "images").rename(root / "pictures"),
         r"has no photographs in images, .* the folder itself",
     ),
-    "one place": (
-        cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]),
-        r"All 9 cameras of \S+poses_bounds.npy are at the same position",
-    ),
+    "one place": (cell(EVERY, [3, 8, 13], [1.0, 2.0, 3.0]), r"All 9 cameras of \S+ are at the same position"),
     "one view": (first_alone, r"Holding out views from 1 leaves 0 to learn from and 1 to judge by"),
 }
 
@@ -241,22 +223,13 @@ COLMAP = {
         r"images.bin cannot be read \(ValueError: it announces \S+ bytes, and has",
     ),
     "files exchanged": (exchanged, r"(cameras|images).bin (cannot be read|holds)"),
-    "more announced": (
-        text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]),
-        r"images.bin .*announces \S+ entries",
-    ),
+    "more announced": (text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]), r"bin .*announces \S+ entries"),
     "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin .*announces \S+ bytes"),
-    "a name that is no text": (
-        swap(b"p_0.png", b"\xffp_0.png"),
-        r"images.bin cannot be read \(UnicodeDecodeError: 'utf-8",
-    ),
+    "a name that is no text": (swap(b"p_0.png", b"\xffp_0.png"), r"images.bin cannot be read \(UnicodeDecodeError"),
     "a photograph twice": (swap(b"p_0.png", b"p_1.png"), r"lists p_1.png more than once, with different"),
     "a photograph without a name": (swap(b"p_0.png", b""), r"lacks the photograph  of"),
     "a camera twice": (cameras(1, *PINHOLE, views=(7, 7)), r"cameras.bin holds 7 more than once"),
-    "unlisted cameras": (
-        cameras(1, *PINHOLE, views=(1,)),
-        r"names a camera that is not there: 2\. .* 8 of the 9 views",
-    ),
+    "unlisted cameras": (cameras(1, *PINHOLE, views=(1,)), r"a camera that is not there: 2\. .* 8 of the 9 views"),
     "a point with NaN": (point(np.nan), FAR_POINT),
     "a point beyond float32": (point(1e300), FAR_POINT),
     "no rotation": (text(IMAGES, lambda old: old[:12] + bytes(32) + old[44:]), r"p_0.png has a pose or intrinsics"),
@@ -284,24 +257,12 @@ TEXT = {
         lines("cameras.txt", lambda old: old.replace(" 6.0\n", "\n")),
         r"cameras.txt, line 2 .*PINHOLE has 4 parameters, not 3",
     ),
-    "no width": (
-        lines("cameras.txt", lambda old: old.replace("E 16", "E nan")),
-        r"cameras.txt, line 2 .*float NaN to integer",
-    ),
-    "words": (
-        lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)),
-        r"images.txt, line 3 .*to float: 'one'",
-    ),
+    "no width": (lines("cameras.txt", lambda old: old.replace("E 16", "E nan")), r"txt, line 2 .*float NaN to"),
+    "words": (lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)), r"images.txt, line 3 .*float: 'one'"),
     "no features": (lines("images.txt", without_features), r"line 3 .*the next line must hold features"),
     "cut short": (lines("images.txt", lambda old: old[: old.index(" p_8.png")]), r"line 19 .*expected 7, got 6"),
-    "points cut short": (
-        lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]),
-        r"line 60 .*expected 3, got",
-    ),
-    "binary": (
-        text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"),
-        r"images.txt cannot be read \(UnicodeDecodeError",
-    ),
+    "points cut short": (lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]), r"line 60 .*expected 3"),
+    "binary": (text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"), r"images.txt cannot be read \(Unicode"),
     "a point far away": (lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)), FAR_POINT),
 }
 
