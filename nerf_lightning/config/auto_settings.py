@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.overrides import key_of
-from nerf_lightning.data.captures.extent import PHOTOGRAPHS, grid_for, model_for
+from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
@@ -23,7 +23,7 @@ AUTO = "auto"
 EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
-SHORT_SECONDS = 100
+SHORT_SECONDS, SHORT_GPU_SECONDS = 100, 10
 """In less time, more and cheaper steps are worth more than finer grids."""
 FEW_PHOTOGRAPHS = 30
 """To train on: fewer tell no finer grid what is true, unless known distances do."""
@@ -33,8 +33,11 @@ TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and 32.09 dB with 1024 and 2^18.
 """
 
+LARGE, LARGE_CELLS = "fast_large", 1024
+"""The model of a scene in a box on a GPU, whose pixels are as small as the cells of so fine a grid, or smaller."""
 GPU_BATCHES = {
     "fast": {"data.batch_rays": 16_384, "data.sample_budget": 1 << 18},
+    LARGE: {"data.batch_rays": 16_384, "data.sample_budget": 1 << 18},
     "fast_proposal": {"data.batch_rays": 4_096},
 }
 """About 2^18 samples a step, as instant-ngp takes: a GPU needs as long for a step of less, which it begins slowly."""
@@ -64,12 +67,17 @@ def resolve_auto(
     if seconds == AUTO:
         seconds = PHOTOS_SECONDS if of_photos else None
     if choices.get("model") == AUTO:
+        on_gpu = _on_gpu(overrides, on_gpu, former)
         name, reason = model_for(scene)
+        if on_gpu and name == IN_A_BOX and grid_for(scene) >= LARGE_CELLS:
+            name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"
         log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
         with_model = [*overrides, f"model={name}"]
         if name == PHOTOGRAPHS:
-            with_model += _for_photographs(scene, overrides, seconds)
-        fitted, picked = compose_config("train", [*with_model, *_for_gpu(name, overrides, on_gpu, former)])
+            short = SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS
+            with_model += _for_photographs(scene, overrides, seconds is not None and seconds < short)
+        with_model += _for_gpu(name, overrides) if on_gpu else []
+        fitted, picked = compose_config("train", with_model)
         fitted.paths = config.paths
         config, choices = fitted, picked
     _settle(config, "doctor", of_photos)
@@ -81,10 +89,20 @@ def resolve_auto(
     return config, chosen(choices)
 
 
-def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | float | None) -> list[str]:
-    """Return the grid and the loss that suit photographs; what a person has typed stays."""
+def _on_gpu(overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None) -> bool:
+    """Tell whether to choose as for a GPU: as a run began that is gone on with, on whatever device."""
+    data = (former or {}).get("data")
+    if not isinstance(data, Mapping) or "data.batch_rays" in map(key_of, overrides):
+        return on_gpu
+    return data.get("batch_rays") in [batches["data.batch_rays"] for batches in GPU_BATCHES.values()]
+
+
+def _for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> list[str]:
+    """Return the grid and the loss that suit photographs; what a person has typed stays.
+
+    `short`: there is little time for training.
+    """
     typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
-    short = seconds is not None and seconds < SHORT_SECONDS
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
     suited = []
     if "encoder" not in typed:
@@ -108,16 +126,12 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], seconds: int | floa
     return suited
 
 
-def _for_gpu(model: str, overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None) -> list[str]:
+def _for_gpu(model: str, overrides: Sequence[str]) -> list[str]:
     """Return the batches of a model on a GPU; what a person has typed stays."""
-    batches, data = GPU_BATCHES[model], (former or {}).get("data")
-    if isinstance(data, Mapping):
-        on_gpu = data.get("batch_rays") == batches["data.batch_rays"]
     typed = set(map(key_of, overrides))
-    larger = [f"{key}={value}" for key, value in batches.items() if key not in typed]
-    if not on_gpu or not larger:
-        return []
-    log.info("batches: about 2^18 samples a step, as suits a GPU (%s)", ", ".join(larger))
+    larger = [f"{key}={value}" for key, value in GPU_BATCHES[model].items() if key not in typed]
+    if larger:
+        log.info("batches: about 2^18 samples a step, as suits a GPU (%s)", ", ".join(larger))
     return larger
 
 

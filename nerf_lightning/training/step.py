@@ -154,9 +154,10 @@ class TrainStep:
 
     def decided_on_host(self) -> str | None:
         """Return what decides on the host what a step computes, which a recording would not follow; None: nothing."""
-        learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
-        decides = ["refinement" if name == "rays" else name for name in learnt]
-        decides += ["a penalty"] if any(part.penalty() is not None for part in self._parts()) else []
+        decides = ["refinement"] if list(self.rays.parameters()) else []
+        decides += [] if self.correction.replays else ["correction"]
+        penalized = [part for part in self._parts() if part.penalty() is not None]
+        decides += ["a penalty"] if any(part is not self.correction for part in penalized) else []
         decides += ["loss"] if self.loss.buffers_to_average() else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
@@ -175,7 +176,9 @@ class TrainStep:
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
-            seen = self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
+            share = self._share(weight)
+            seen = self._in_tiles(batch, _backward, share, key, batch.num_rays)
+            self._penalize(batch, _backward, share)
             if self._guards_in_recording:
                 self.guard.keep_finite(seen.losses, self._named_parameters())
             return seen
@@ -345,10 +348,13 @@ class TrainStep:
                 part.zero_grad(set_to_none=False)
             for count, before in zip(self.model.sample_counts(), counts, strict=True):
                 count.copy_(before)
+        self._penalize(batch, backward, share)
+        return seen
+
+    def _penalize(self, batch: Batch, backward: Backward, share: Share) -> None:
         for part in self._parts():
             if (penalty := part.penalty()) is not None:
                 backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
-        return seen
 
     def validate(self, batch: Batch, errors: RayErrors) -> Tensor:
         """Collect and average the squared error of rays that no mask leaves out; backgrounds as at evaluation."""

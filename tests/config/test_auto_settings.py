@@ -22,6 +22,7 @@ from nerf_lightning.runs.folder import former_config
 IN_A_BOX = ball_scene()
 PHOTOGRAPHS = replace(IN_A_BOX, space="contracted")
 FORWARD_FACING = replace(IN_A_BOX, space="ndc")
+LARGE_PICTURES = replace(IN_A_BOX, cameras=replace(IN_A_BOX.cameras, focal=IN_A_BOX.cameras.focal * 100.0))
 
 
 def chosen_for(scene, *overrides):
@@ -42,19 +43,22 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     assert "(choose another with model=NAME)" in caplog.text
 
 
-@pytest.mark.parametrize(("scene", "model"), [(IN_A_BOX, "fast"), (PHOTOGRAPHS, "fast_proposal")])
-def test_a_gpu_takes_larger_batches_and_says_so(caplog, scene, model):
+@pytest.mark.parametrize(
+    ("scene", "model"), [(IN_A_BOX, "fast"), (LARGE_PICTURES, "fast_large"), (PHOTOGRAPHS, "fast_proposal")]
+)
+def test_a_gpu_takes_larger_batches_and_for_large_pictures_a_larger_model_and_says_so(caplog, scene, model):
     caplog.set_level("INFO")
     config, choices = compose_config("train", [])
     plain = resolve_auto(config, choices, [], scene)[0]
     assert "samples a step" not in caplog.text
-    larger = resolve_auto(config, choices, [], scene, on_gpu=True)[0]
+    larger, picked = resolve_auto(config, choices, [], scene, on_gpu=True)
+    assert picked["model"] == model
     assert larger.data.batch_rays == GPU_BATCHES[model]["data.batch_rays"] == 2 * plain.data.batch_rays
     assert caplog.text.count("about 2^18 samples a step") == 1
     # A run goes on with the batches that it began with, wherever that was.
     for on_gpu, former in ((True, plain), (False, larger)):
         again = resolve_auto(config, choices, [], scene, on_gpu, OmegaConf.to_container(former, resolve=True))[0]
-        assert again.data == former.data
+        assert (again.data, again.encoder) == (former.data, former.encoder)
     typed = ["data.batch_rays=77", "data.sample_budget=5000"]
     config, choices = compose_config("train", typed)
     assert resolve_auto(config, choices, typed, scene, on_gpu=True)[0].data.batch_rays == 77

@@ -15,13 +15,17 @@ from support.configs import options
 from support.gpu_training import default_callbacks, step_by_step
 
 from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.system import RadianceFieldSystem
 
-pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.filterwarnings("ignore:Synchronization debug mode", "ignore:Warning. Profiler clears events"),
+]
 WARM = 2  # the optimizer's state, numbers kept on the device, compiled kernels
 
 
@@ -39,8 +43,8 @@ def never_waiting(device):
 
 
 def updates(run) -> set[int]:
-    """The steps in which a grid is updated, and read."""
-    levels = [level for level in run.training.model.modules() if isinstance(level, RaggedLevel)]
+    """The steps in which a grid is updated, and read (one of `MaskedLevel` at its first time alone)."""
+    levels = [level for level in run.training.model.modules() if isinstance(level, RaggedLevel | MaskedLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 

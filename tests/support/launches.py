@@ -114,8 +114,11 @@ def _bytes(values: list[Any]) -> int:
     return sum(min(each.nbytes, each.untyped_storage().nbytes()) for each in tensors)  # expanded ones are smaller
 
 
-def forgotten(model: str, precision: str) -> list[str]:
-    """Return the arrays that a recording of a small model's step would read after they are gone."""
+def replayed(model: str, precision: str) -> tuple[list[str], dict[str, int]]:
+    """Return the arrays that a recording of a small model's step would read after they are gone.
+
+    And what a step asks for beside its replay.
+    """
     with StandInDevice("cuda") as there, Launches() as launches:
         run = step_by_step(model, there.device, precision, None, *small(model, resolution=8, num_levels=4))
         read: dict[str, StorageWeakRef] = {}
@@ -129,9 +132,10 @@ def forgotten(model: str, precision: str) -> list[str]:
 
         run.training.record_gradients(record=record)
         for _ in range(8):  # across updates of grids
+            launches.counts.clear()
             run.step()
         gc.collect()
-        return [name for name, array in read.items() if array.expired()]
+        return [name for name, array in read.items() if array.expired()], dict(launches.counts)
 
 
 def measured(model: str, precision: str) -> dict[str, Any]:
@@ -153,7 +157,9 @@ def measured(model: str, precision: str) -> dict[str, Any]:
             for _ in range(STEPS):
                 run.step()
     without = run.all_losses().tolist()
-    return {"step": step, "tile": tile, "losses": losses, "without": without, "forgotten": forgotten(model, precision)}
+    forgotten, replay = replayed(model, precision)
+    found = {"step": step, "replay": replay, "tile": tile, "losses": losses, "without": without}
+    return found | {"forgotten": forgotten}
 
 
 if __name__ == "__main__":

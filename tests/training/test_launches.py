@@ -13,13 +13,14 @@ import pytest
 pytest.importorskip("triton", reason="triton is not installed (Linux only)")
 
 BUDGETS = {
-    # On the device (operations and kernels): a step, a rendered tile. On the host: a step.
-    "fast_small,bf16-mixed": (87, 38, 2),
-    "fast_proposal,bf16-mixed": (132, 33, 2),
-    "nerf_tiny,bf16-mixed": (319, 120, 4),
-    "fast,bf16-mixed": (87, 38, 2),
-    "fast,32-true": (97, 42, 2),
-    "fast_proposal,32-true": (152, 41, 2),
+    # On the device (operations and kernels): a step, one that is replayed beside its replay, a rendered tile. On the
+    # host: a step.
+    "fast_small,bf16-mixed": (87, 25, 38, 2),
+    "fast_proposal,bf16-mixed": (132, 27, 33, 2),
+    "nerf_tiny,bf16-mixed": (319, 25, 120, 4),
+    "fast,bf16-mixed": (87, 25, 38, 2),
+    "fast,32-true": (97, 25, 42, 2),
+    "fast_proposal,32-true": (152, 27, 41, 2),
 }
 QUICK = list(BUDGETS)[:3]
 CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
@@ -42,6 +43,9 @@ def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
     assert found["step"]["kernels"] > 0
     assert found["forgotten"] == []  # what a recording (CUDA graph) reads is written to, and never replaced
     assert found["losses"] == pytest.approx(found["without"], rel=TOLERANCE[precision])
-    counted = *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "tile")), found["step"]["host"]
+    counted = (
+        *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "replay", "tile")),
+        found["step"]["host"],
+    )
     print(f'    "{case}": {counted},')  # pytest -rP shows the table anew
     assert all(asked <= budget for asked, budget in zip(counted, BUDGETS[case], strict=True)), (counted, BUDGETS[case])

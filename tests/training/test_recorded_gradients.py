@@ -95,9 +95,13 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
 
 @pytest.mark.parametrize(
     ("model", "changes", "variants"),
-    [("nerf_tiny", ("data.batch_rays=48",), 1), ("fast_proposal", ("encoder.log2_table_size=10", *PROPOSALS), 2)],
+    [
+        ("nerf_tiny", ("data.batch_rays=48",), 1),
+        ("fast_proposal", ("encoder.log2_table_size=10", *PROPOSALS), 2),
+        ("fast_small", (*SMALL, "correction=exposure"), 1),
+    ],
 )
-def test_models_with_equally_many_samples_have_a_recording_for_each_variant_of_their_steps(model, changes, variants):
+def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
     run = trained([48] * 8, True, model, *changes)
     assert_same(run, trained([48] * 8, False, model, *changes))
     assert len(run.training._recorded.recordings) == variants
@@ -153,3 +157,21 @@ def test_a_recorded_step_that_is_not_finite_changes_nothing_and_is_counted(monke
     run.step()
     assert run.training.guard.state() == [1, 0]
     assert not torch.equal(run.training.model.state_dict()[name], before[name])
+
+
+@pytest.mark.parametrize(
+    ("setting", "device", "compile", "model", "recorded"),
+    [
+        ("auto", "cuda", False, "fast_small", True),
+        ("auto", "cuda", True, "fast_small", False),
+        ("auto", "cpu", False, "fast_small", False),
+        ("auto", "cuda", False, "fast_small,blend_in", False),
+        (False, "cuda", False, "fast_small", False),
+    ],
+)
+def test_steps_are_recorded_where_that_is_possible(setting, device, compile, model, recorded):
+    name, *changes = model.split(",")
+    step = step_by_step(name, CPU, "32-true", None, *(f"encoder.{change}=0.5" for change in changes)).training
+    settings = TrainerSettings(accelerator="cpu", cuda_graph=setting, compile=compile)
+    settings.device_type = device
+    assert settings.records(step) is recorded

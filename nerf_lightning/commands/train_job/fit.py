@@ -90,8 +90,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         step.tile_points = settings.tile_points
     settings.prepare(step.model)
     job.system.record["precision"] = settings.precision
-    automatic = settings.cuda_graph == "auto" and settings.device_type == "cuda" and ranks.world_size() == 1
-    records = settings.cuda_graph is True or (automatic and step.decided_on_host() is None)
+    records = settings.records(step)
     # A recording takes whole batches.
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not records
     if former is None and measures_tile:

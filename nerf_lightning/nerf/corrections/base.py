@@ -22,6 +22,9 @@ class Correction(Part, ABC):
     the model's own, neutral colors. As it begins, it changes no bit.
     """
 
+    replays: bool = False
+    """True where it does the same in each step, so that a recording of it (trainer.cuda_graph) can be replayed."""
+
     def fit_to(self, scene: Scene) -> None:
         """Take note of the photographs, once, before training.
 
@@ -58,6 +61,8 @@ class Correction(Part, ABC):
 
 class NoCorrection(Correction):
     """Leave every color as it is: photographs show what there is."""
+
+    replays = True
 
     def fit_to(self, scene: Scene) -> None:
         """Take any scene."""

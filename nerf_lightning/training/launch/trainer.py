@@ -10,13 +10,14 @@ from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import distributed
 
 from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precision
-from nerf_lightning.compute.ranks import processes_here
+from nerf_lightning.compute.ranks import processes_here, world_size
 from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
 from nerf_lightning.training.launch.strategy import OneSumPerStep
+from nerf_lightning.training.step import TrainStep
 
 MOST_EPOCHS = 1 << 31
 
@@ -39,7 +40,7 @@ class TrainerSettings(ComputeSettings):
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
-            for refinement, correction and losses that learn. auto: where the run permits it, in one process.
+            for refinement and losses that learn. auto: where the run permits it, in one process.
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
@@ -87,6 +88,13 @@ class TrainerSettings(ComputeSettings):
         self.clip_norm, self.val_every_steps = clip_norm, val_every_steps
         self.compile, self.deterministic = compile, deterministic
         self.launched_by = launched_by  # read before the processes are (launch/processes.py)
+
+    def records(self, step: TrainStep) -> bool:
+        """Tell whether to record a run's steps; auto: not several processes', nor compiled ones, which nobody tried."""
+        if self.cuda_graph != "auto":
+            return self.cuda_graph
+        tried = self.device_type == "cuda" and world_size() == 1 and not self.compile
+        return tried and step.decided_on_host() is None
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
