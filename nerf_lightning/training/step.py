@@ -150,7 +150,7 @@ class TrainStep:
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
         self.loss.forget()
-        self._forget_recordings()
+        self.forget_recordings()
 
     def decided_on_host(self) -> str | None:
         """Return what decides on the host what a step computes, which a recording would not follow; None: nothing."""
@@ -187,6 +187,11 @@ class TrainStep:
             return [*self.model.sample_counts(), *self.guard.tensors(self.device)]
 
         self._recorded = RecordedGradients(compute, self._parameters(), counts, lambda: self.model.step_variant, record)
+
+    def forget_recordings(self) -> None:
+        """Free the memory of all recordings; a further step makes new ones, of where everything lies then."""
+        if self._recorded is not None:
+            self._recorded.recordings.clear()
 
     @property
     def records(self) -> bool:
@@ -229,7 +234,7 @@ class TrainStep:
             skipped: steps that were left out before.
         """
         self.progress.attempt, self.progress.rollbacks = former.attempt + 1, former.rollbacks + 1
-        self._forget_recordings()
+        self.forget_recordings()
         self.guard.restore([skipped, 0], self.device)
 
     def new_optimizer(self) -> Optimizer:
@@ -397,11 +402,6 @@ class TrainStep:
         num_rays = self.progress.batch_rays
         first = ranks.share(num_rays // self.rays_together).start * self.rays_together
         return Share(first, num_rays, weight)
-
-    def _forget_recordings(self) -> None:
-        # What was taken up may lie elsewhere in memory.
-        if self._recorded is not None:
-            self._recorded.recordings.clear()
 
     def _parts(self) -> Iterator[Part]:
         """Return the parts of the model, then those beside it."""

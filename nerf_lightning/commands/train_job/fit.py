@@ -50,6 +50,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
             f"{_what_is_left(folder)} If it fails again, nerf selftest tells whether the GPU computes right, and "
             "trainer=cpu does without it."
         ) from error
+    job.system.step.forget_recordings()
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
         log.info("%d steps in %s", steps, spoken(job.clock.seconds))

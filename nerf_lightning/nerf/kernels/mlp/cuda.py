@@ -24,6 +24,7 @@ FORWARD: dict[str, Any] = {"enable_fp_fusion": True}
 # A pipeline would keep the rows of several rounds in shared memory: 124 KiB for layers 32-64-64-3, where most GPUs have
 # 99. In one stage it is 16 to 32 KiB, and 64 for layers of 128. Of larger blocks and fewer warps most sums would not
 # fit into the registers.
+# With 4 warps the code of Triton 3.6 ends in an illegal memory access on an H100 (triton-lang/triton, issue 11366).
 BACKWARD: dict[str, Any] = {"enable_fp_fusion": True, "num_stages": 1, "num_warps": 8}
 PROGRAMS = 4
 """For each multiprocessor: each sums up gradients of the weights for itself, and the order of all sums is fixed. On an
