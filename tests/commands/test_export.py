@@ -88,11 +88,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
 
 @pytest.mark.parametrize(
     ("what", "name", "kind"),
-    [
-        ("cameras", "sparse", "file"),
-        ("images", "normals", "file"),
-        ("page", "page.html", "folder"),
-    ],
+    [("cameras", "sparse", "file"), ("images", "normals", "file"), ("page", "page.html", "folder")],
 )
 def test_what_lies_where_something_is_to_be_written_is_said_before_the_work(nerf, last, tmp_path, what, name, kind):
     place = tmp_path / name

@@ -18,9 +18,9 @@ SEARCHED = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'
 VOXELS = ("model=voxels", "model.resolution=8", "sampler@model.sampler=stratified_16")
 
 
-@pytest.mark.parametrize("where", [SEARCHED, f"--config-dir={Path(extensions.__file__).parent / 'conf'}"])
-def test_yamls_of_ones_own_are_found_where_the_model_is_left_open(nerf, capture, tmp_path, where):
+def test_yamls_of_ones_own_are_found_where_the_model_is_left_open(nerf, capture, tmp_path):
     """The fault: the config was composed again without them, once the model was chosen."""
+    where = f"--config-dir={Path(extensions.__file__).parent / 'conf'}"
     scene = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={tmp_path}/run")
     small = ("encoder.first.log2_table_size=8", "data.batch_rays=64", "trainer.max_steps=2", "trainer.tile_points=8192")
     done = nerf("train", where, *scene, *small, "encoder=joined", "final.video=false", "final.evaluate=false")

@@ -185,10 +185,7 @@ RECORDS = {
     "no pixels": (camera(height=torch.zeros(6, dtype=torch.int64)), "width is not above 0"),
     "no extent": (recorded(far=torch.zeros(6)), "near is not everywhere from 0"),
     "no box": (recorded(aabb=torch.zeros(2, 3)), "aabb has no inside"),
-    "no frame": (
-        recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0])).double()),
-        "to_user is not a rotation",
-    ),
+    "no frame": (recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0])).double()), "to_user is not a rot"),
     "no views": (recorded(view_names=()), "of 0 views"),
     "views alike": (recorded(view_names=("a",) * 6), "view_names names two views alike"),
     "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "more than 1024 characters"),

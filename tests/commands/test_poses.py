@@ -128,7 +128,7 @@ def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, pictures, 
         frame = Image.fromarray(pixels).resize((192, 192), Image.Resampling.NEAREST)
         frames.append(np.asarray(frame.filter(ImageFilter.GaussianBlur(blur))))
     imageio.imwrite(tmp_path / "film.mp4", np.stack(frames), plugin="FFMPEG", fps=10, quality=9)
-    result = poses(f"video={tmp_path / 'film.mp4'}", "every=1")
+    result = poses(f"video={tmp_path / 'film.mp4'}", "every=1", "num_features=300")
     refused(result, tmp_path, "no camera could be placed for the 4 frames", said, "Film again")
 
 

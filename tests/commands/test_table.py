@@ -288,18 +288,7 @@ def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypat
     rule = next(number for number, line in enumerate(lines) if line.startswith("─"))
     head = " ".join(lines[2:rule]).split()
     assert {"model", "PSNR", "resolution", "some_long_setting"} <= set(head)
-    whole = [
-        "scene",
-        "model",
-        "resolution",
-        "PSNR",
-        "time",
-        "steps",
-        "some_long_setting",
-        "SSIM",
-        "seeds",
-        "MB",
-    ]
+    whole = ["scene", "model", "resolution", "PSNR", "time", "steps", "some_long_setting", "SSIM", "seeds", "MB"]
     assert set(head) <= {*whole, *(f"a{key}." for key in range(6))}
     assert f"a{head.count('some_long_setting')}.some_long_setting" in f"{lines[end]} a6.some_long_setting"
 

@@ -6,7 +6,6 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
-from support.captures import real_capture
 from support.running import said
 from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -168,19 +167,6 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
         "data.batch_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
         "data.val_rays=64",
         f"paths.output_dir={tmp_path}/run",
-    )  # fmt: skip
-    assert result.code == 0, result.err
-    assert (tmp_path / "run" / "metrics.json").is_file()
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("experiment", ["fern", "fern_article"])
-def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
-    result = nerf(
-        "train", f"experiment={experiment}", f"scene.root={real_capture('fern')}", "trainer.max_epochs=null",
-        "trainer.max_steps=2", "data.batch_rays=64", "data.val_rays=64", "scene.downscale=28", "evaluation.max_views=1",
-        "trainer.tile_points=8192",
-        "path.num_frames=2", "path.width=8", f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err
     assert (tmp_path / "run" / "metrics.json").is_file()

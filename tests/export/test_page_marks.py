@@ -96,8 +96,7 @@ def test_the_first_view_is_the_most_average_of_the_training_views():
 
 
 @pytest.mark.parametrize(
-    ("degrees", "wanted"),
-    [((0.0, 90.0, 180.0, 270.0), None), ((350.0, 10.0, 30.0), 10.0), ((0.0, 60.0, 120.0), 20.0)],
+    ("degrees", "wanted"), [((0.0, 90.0, 180.0, 270.0), None), ((350.0, 10.0, 30.0), 10.0), ((0.0, 60.0, 120.0), 20.0)]
 )
 def test_the_page_turns_as_far_as_the_cameras_stand(degrees, wanted):
     found = sway(around(*degrees), [0.0, 0.0, 0.0], UP)

@@ -19,8 +19,9 @@ from nerf_lightning.training.step import Share
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
-@pytest.mark.parametrize("background", ["white", "black", "random", "none"])
-@pytest.mark.parametrize("tile_points", [16, 100, 512])
+@pytest.mark.parametrize(
+    ("tile_points", "background"), [(16, "random"), (100, "white"), (100, "black"), (512, "random"), (512, "none")]
+)
 def test_a_tiled_step_equals_the_whole_step_up_to_rounding(tile_points, background):
     scene = ball_scene()
     model = tiny_model(density_bias=0.5)
@@ -270,8 +271,10 @@ def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_mo
     assert len(others["params"]) + len(own) == len(list(step.model.parameters()))
 
 
-@pytest.mark.parametrize("tile_points", [None, 16, 200])
-@pytest.mark.parametrize("parts", [[slice(0, 64)], [slice(0, 16), slice(16, 64)]])
+@pytest.mark.parametrize(
+    ("tile_points", "parts"),
+    [(None, [slice(0, 64)]), (16, [slice(0, 64)]), (200, [slice(0, 16), slice(16, 64)])],
+)
 def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(tile_points, parts):
     model = tiny_model(density_bias=0.5).requires_grad_(False)
     light, heavy = (a_step_with_shifts(tile_points, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))

@@ -58,13 +58,7 @@ def test_headers_of_arrays_that_no_parser_takes(tmp_path, name):
 @pytest.mark.skipif(sys.platform != "linux", reason="a file that can be opened and not read lies in /proc")
 def test_an_archive_that_cannot_be_read(tmp_path):
     (tmp_path / "a.npz").symlink_to("/proc/self/mem")
-    refused(
-        NpzReader(str(tmp_path / "a.npz")).read,
-        parts=(
-            "a.npz cannot be read",
-            "Remove it, and copy",
-        ),
-    )
+    refused(NpzReader(str(tmp_path / "a.npz")).read, parts=("a.npz cannot be read", "Remove it, and copy"))
 
 
 def test_folders_within_folders_without_end(tmp_path):

@@ -114,11 +114,7 @@ def test_file_path_may_have_its_ending_and_a_dot_is_none(root, ending):
 @pytest.mark.data
 def test_reads_the_lego_of_200_pixels():
     scene = BlenderReader(str(real_capture("lego_200"))).read()
-    assert {split: len(views) for split, views in scene.splits.items()} == {
-        "train": 100,
-        "val": 20,
-        "test": 25,
-    }
+    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 100, "val": 20, "test": 25}
     assert scene.cameras.focal[0, 0].item() == pytest.approx(277.7778, abs=1e-3)
     assert scene.cameras.c2w[:, :, 3].norm(dim=-1).tolist() == pytest.approx([4.0311] * 145, abs=1e-3)
     assert len(set(scene.view_names)) == 145

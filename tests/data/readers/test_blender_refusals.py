@@ -33,10 +33,7 @@ FRAME = {"file_path": "train/r_0", "transform_matrix": pose(0)}
         ({"near": 6.0}, r"scene.near is 6.0 and scene.far is 6.0, but rays need 0 <= near < far"),
         ({"near": -1.0}, r"rays need 0 <= near < far"),
         ({"far": float("nan")}, r"rays need 0 <= near < far"),
-        (
-            {"background": "pink"},
-            r"background is 'pink'; choose one of white, black, random, white_or_random, black_or",
-        ),
+        ({"background": "pink"}, r"background is 'pink'; choose one of white, black, random, white_or_random"),
         ({"aabb_half": 0.0}, r"scene.aabb_half is 0.0"),
         ({"downscale": 3}, r"downscale=3 does not divide .* 8 x 8 pixels. Choose one of 1, 2, 4, 8\."),
     ],

@@ -27,14 +27,7 @@ from support.plain_capture import (
     said_once,
     to_utf_16,
 )
-from support.posed_captures import (
-    photograph,
-    ring,
-    write_colmap,
-    write_llff,
-    write_pictures,
-    write_transforms,
-)
+from support.posed_captures import photograph, ring, write_colmap, write_llff, write_pictures, write_transforms
 
 from nerf_lightning.messages.errors import InputError
 

@@ -150,10 +150,6 @@ def cell(row, column, value):
     return rows(change)
 
 
-def pickled(root):
-    np.save(root / "poses_bounds.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-
-
 def archived(root):
     with (root / "poses_bounds.npy").open("wb") as file:
         np.savez(file, poses=np.zeros((9, 17)))
@@ -172,15 +168,10 @@ LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
     "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
-    "empty": (text(NPY, lambda old: b""), NO_ARRAY),
     "an archive": (archived, NO_ARRAY),
-    "pickled": (pickled, r"poses_bounds.npy cannot be read \(ValueError: Object arrays cannot be loaded"),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
     "a photograph missing": (lambda root: one_picture(root).unlink(), r"has 9 poses, but \S+images has 8 photographs"),
-    "a photograph too many": (
-        lambda root: write_pictures(root / "images", ("x.png",), (16, 12)),
-        r"has 10 photographs",
-    ),
+    "a photograph too many": (lambda root: write_pictures(root / "images", ("x.png",), (16, 12)), r"10 photographs"),
     "NaN in a pose": (cell(2, 3, np.nan), r"the view p_2.png has a pose or intrinsics with NaN or infinity"),
     "infinite depth": (cell(5, 16, np.inf), r"bounds.* are not used, since .* 1 of 9 .*p_5.png"),
     "bounds exchanged": (cell(4, 15, 100.0), r"bounds.* are not used, since .* 1 of 9 .*p_4.png"),
@@ -246,10 +237,7 @@ PINHOLE = (20.0, 20.0, 8.0, 6.0)
 FAR_POINT = r"sparse/0: 1 of (1|60) sparse points are NaN or beyond 1e\+09, and are left out"
 COLMAP = {
     "no model": (lambda root: (root / "sparse").rename(root / ".sparse"), r"holds no COLMAP model: .* sparse, "),
-    "half a model": (
-        lambda root: (root / IMAGES).unlink(),
-        r"images.bin cannot be read \(FileNotFoundError",
-    ),
+    "half a model": (lambda root: (root / IMAGES).unlink(), r"images.bin cannot be read \(FileNotFoundError"),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not supported"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
@@ -302,28 +290,13 @@ TEXT = {
         lines("cameras.txt", lambda old: old.replace(" 6.0\n", "\n")),
         r"cameras.txt, line 2 .*PINHOLE has 4 parameters, not 3",
     ),
-    "no width": (
-        lines("cameras.txt", lambda old: old.replace("E 16", "E nan")),
-        r"cameras.txt, line 2 .*float NaN to integer",
-    ),
-    "words": (
-        lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)),
-        r"images.txt, line 3 .*to float: 'one'",
-    ),
+    "no width": (lines("cameras.txt", lambda old: old.replace("E 16", "E nan")), r"txt, line 2 .*float NaN to"),
+    "words": (lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)), r"images.txt, line 3 .*float: 'one'"),
     "no features": (lines("images.txt", without_features), r"line 3 .*the next line must hold features"),
     "cut short": (lines("images.txt", lambda old: old[: old.index(" p_8.png")]), r"line 19 .*expected 7, got 6"),
-    "points cut short": (
-        lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]),
-        r"line 60 .*expected 3, got",
-    ),
-    "binary": (
-        text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"),
-        r"images.txt cannot be read \(UnicodeDecodeError",
-    ),
-    "a point far away": (
-        lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)),
-        FAR_POINT,
-    ),
+    "points cut short": (lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]), r"line 60 .*expected 3"),
+    "binary": (text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"), r"images.txt cannot be read \(Unicode"),
+    "a point far away": (lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)), FAR_POINT),
 }
 
 

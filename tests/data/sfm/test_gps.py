@@ -25,11 +25,7 @@ def photograph(path, place):
 def places_around(metres):
     """Return latitude, longitude and height of points in meters east, north and up from a place."""
     return [
-        (
-            PLACE[0] + north / 111_190,
-            PLACE[1] + east / (111_320 * np.cos(np.radians(PLACE[0])) * 1.0018),
-            PLACE[2] + up,
-        )
+        (PLACE[0] + north / 111_190, PLACE[1] + east / (111_320 * np.cos(np.radians(PLACE[0])) * 1.0018), PLACE[2] + up)
         for east, north, up in metres
     ]
 

@@ -130,6 +130,7 @@ def test_other_widths_take_the_other_way(monkeypatch, kernels, dtype):
     assert far_apart(mlp(points, weights, matmul_precision), mlp_torch(points, weights).double()) < 2e-2
 
 
+@pytest.mark.minutes
 @pytest.mark.skipif(
     llvm.get_host_cpu_features().get("avx512f") is None, reason="this CPU's registers are narrow anyway"
 )

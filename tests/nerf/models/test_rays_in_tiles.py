@@ -95,8 +95,7 @@ def large_view():
     return RayGenerator(resized(cameras, WIDTH * side, HEIGHT * side), SCENE.near, SCENE.far)
 
 
-@pytest.mark.parametrize("clip", [None, Clip(near=2.5)], ids=["whole", "clipped"])
-@pytest.mark.parametrize("per_side", [1, 2])
+@pytest.mark.parametrize(("clip", "per_side"), [(Clip(near=2.5), 1), (None, 2)], ids=["clipped", "whole"])
 def test_no_more_rays_than_a_tile_has_are_made_at_once(clip, per_side, monkeypatch):
     monkeypatch.setattr(render_image, "threads_on", lambda device: 1)
     model, rays_of, made = Fog(), large_view(), []

@@ -141,12 +141,11 @@ def test_a_rollback_without_a_checkpoint_begins_anew_at_a_lower_rate(tmp_path, c
 
 
 @pytest.mark.filterwarnings("ignore:.*your dataloader is not resumable.*")
-@pytest.mark.parametrize("stopped_at", [15, 20])
-def test_a_resume_keeps_the_lowered_rate_and_the_attempt(tmp_path, stopped_at):
-    """15 is the first save after the rollback, which happened after 12 steps."""
+def test_a_resume_keeps_the_lowered_rate_and_the_attempt(tmp_path):
+    """It stops at the first save after the rollback, which happened after 12 steps."""
     guard = partial(NanGuard, on_nan="rollback", patience=4)
     whole = run(tmp_path / "whole", guard(), limit=0.006)
-    run(tmp_path / "parts", guard(), limit=0.006, max_steps=stopped_at)
+    run(tmp_path / "parts", guard(), limit=0.006, max_steps=15)
     resumed = run(tmp_path / "parts", guard(), limit=0.006, resume=tmp_path / "parts" / "checkpoints" / "last.ckpt")
     assert resumed.step.progress == whole.step.progress
     assert resumed.optimizers().param_groups[0]["lr"] == whole.optimizers().param_groups[0]["lr"]

@@ -78,8 +78,7 @@ def test_what_cannot_be_filmed_is_named(tmp_path):
 def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
     times = (0.0, 1.0, 1.5)
     file = keyframe_file(
-        tmp_path,
-        *(Keyframe(p, look_at=(1.0, 2.0, p[2]), time=t) for p, t in zip(PLACES, times, strict=True)),
+        tmp_path, *(Keyframe(p, look_at=(1.0, 2.0, p[2]), time=t) for p, t in zip(PLACES, times, strict=True))
     )
     cameras = KeyframePath(file, fps=10).cameras(frame())
     assert len(cameras.c2w) == 16

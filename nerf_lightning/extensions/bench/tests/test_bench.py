@@ -16,11 +16,7 @@ def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
         "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
     )  # fmt: skip
     assert result.code == 0, result.err
-    for name in (
-        "training rays/s",
-        "times plain",
-        "whole rays, loss and gradients, share of a step",
-    ):
+    for name in ("training rays/s", "times plain", "whole rays, loss and gradients, share of a step"):
         assert name in result.out
     assert {1, 2} <= set(threads)
     measured = json.loads((tmp_path / "bench" / "bench.json").read_text())

@@ -108,7 +108,7 @@ def test_an_empty_field_is_refused_with_the_opacities_seen(tmp_path):
 
 
 def test_a_cloud_takes_no_more_memory_than_is_asked_for(tmp_path):
-    scene = scene_record(ball_scene(num_views=24, size=64))
+    scene = scene_record(ball_scene(num_views=12, size=64))
     wall = solid(lambda positions: -torch.ones_like(positions[..., 0]), samples=4)  # all pixels are opaque
     num_pixels = len(scene.splits["train"]) * 64**2
 
