@@ -233,6 +233,7 @@ def test_files_and_pages_that_are_linked_are_there():
     assert not missing
 
 
+@pytest.mark.minutes
 def test_the_site_is_built_without_a_warning(tmp_path):
     for needed in ("furo", "myst_nb", "sphinx_copybutton"):
         pytest.importorskip(needed)
