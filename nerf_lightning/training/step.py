@@ -62,6 +62,10 @@ def _penalties(renderings: list[Rendering]) -> dict[str, Tensor]:
     return {"penalty": torch.stack(means)}
 
 
+KNOWN = (__name__.partition(".")[0], "torch")
+"""Packages of whose modules it is known whether a recorded step follows them."""
+
+
 @dataclass(frozen=True)
 class Share:
     """A process's part of a step's batch."""
@@ -162,6 +166,12 @@ class TrainStep:
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
         return ", ".join(decides) or (None if self.model.replays else "model")
+
+    @property
+    def has_foreign_parts(self) -> bool:
+        """Whether a class of somebody else's computes here, of which nobody knows what it decides on the host."""
+        modules = (module for part in (*self.parts.values(), self.loss) for module in part.modules())
+        return any(type(module).__module__.partition(".")[0] not in KNOWN for module in modules)
 
     def record_gradients(self, record: Recorder = cuda_graph) -> None:
         """Record the way forward and back of batches, whole, and replay it from now on.
@@ -309,9 +319,10 @@ class TrainStep:
         try:
             return recorded(batch, share.weight, self._key)
         except RuntimeError as error:
-            if not is_out_of_memory(error):
+            if not is_out_of_memory(error) and "captur" not in str(error):
                 raise
-        log.warning("There is no memory to record a step: all kernels of each step are launched one by one.")
+            cause = "there is no memory" if is_out_of_memory(error) else f"CUDA refuses: {error}".splitlines()[0]
+        log.warning("Steps are not recorded: %s. The kernels of each step are launched one by one.", cause)
         self._recorded = None
         for part in self.parts.values():
             part.zero_grad(set_to_none=False)

@@ -130,16 +130,26 @@ def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
     assert asked == {"capture_error_mode": "thread_local"}
 
 
-def test_without_memory_for_a_recording_the_step_is_taken_without(caplog):
-    def no_room(work):
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory"), "there is no memory"),
+        (
+            RuntimeError("CUDA error: operation not permitted when stream is capturing\nSearch"),
+            "stream is capturing. The",
+        ),
+    ],
+)
+def test_what_cannot_be_recorded_is_computed_without(error, cause, caplog):
+    def refused(work):
         work()  # which leaves gradients and counts behind
-        raise torch.OutOfMemoryError("CUDA out of memory")
+        raise error
 
     run = step_by_step("fast_small", CPU, "32-true", None, *SMALL)
-    run.training.record_gradients(record=no_room)
+    run.training.record_gradients(record=refused)
     for _ in range(3):
         run.step()
-    assert [each.count("no memory to record") for each in caplog.messages] == [1]
+    assert [each.count(cause) for each in caplog.messages] == [1]
     assert not run.training.records
     assert_same(run, trained([48] * 3, record=False))
 
@@ -175,3 +185,5 @@ def test_steps_are_recorded_where_that_is_possible(setting, device, compile, mod
     settings = TrainerSettings(accelerator="cpu", cuda_graph=setting, compile=compile)
     settings.device_type = device
     assert settings.records(step) is recorded
+    step.loss = type("Own", (type(step.loss),), {"__module__": "my_parts"})()
+    assert settings.records(step) is False

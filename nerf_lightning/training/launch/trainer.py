@@ -40,7 +40,8 @@ class TrainerSettings(ComputeSettings):
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
-            for refinement and losses that learn. auto: where the run permits it, in one process.
+            for refinement and losses that learn. auto: where that is possible, in one process, without parts of your
+            own, which might decide something in Python at each step.
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
@@ -90,10 +91,13 @@ class TrainerSettings(ComputeSettings):
         self.launched_by = launched_by  # read before the processes are (launch/processes.py)
 
     def records(self, step: TrainStep) -> bool:
-        """Tell whether to record a run's steps; auto: not several processes', nor compiled ones, which nobody tried."""
+        """Tell whether to record a run's steps.
+
+        auto: not several processes', compiled ones, or those of parts of one's own, which nobody has tried.
+        """
         if self.cuda_graph != "auto":
             return self.cuda_graph
-        tried = self.device_type == "cuda" and world_size() == 1 and not self.compile
+        tried = self.device_type == "cuda" and world_size() == 1 and not self.compile and not step.has_foreign_parts
         return tried and step.decided_on_host() is None
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
