@@ -113,7 +113,7 @@ class RecordedGradients:
         finally:
             for count, former in zip(self.counts(), before, strict=True):
                 count.copy_(former)
-            for parameter in self.parameters:
-                if parameter.grad is not None:
-                    parameter.grad.zero_()
+        for parameter in self.parameters:
+            if parameter.grad is not None:
+                parameter.grad.zero_()
         return _Recording(batch, weight, kept_key, replay, seen, [parameter.grad for parameter in self.parameters])

@@ -46,9 +46,9 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
             raise
         trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
         raise InputError(
-            "The GPU has failed after "
-            f"step {trainer.global_step}: {' '.join(str(error).split())[:200]}. {_what_is_left(folder)} If it fails "
-            "again, nerf selftest checks the GPU's results, and trainer=cpu does not use it."
+            f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
+            f"{_what_is_left(folder)} If it fails again, nerf selftest checks the GPU's results, and trainer=cpu does "
+            "not use it."
         ) from error
     job.system.step.forget_recordings()
     if ranks.is_first():

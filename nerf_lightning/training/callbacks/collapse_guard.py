@@ -24,7 +24,7 @@ class CollapseGuard(Callback):
     of rays, and goes through the center crop again; steps already taken are not given back.
 
     Args:
-        every_steps: steps between two histograms.
+        every_steps: steps between two looks at the renders.
         until_step: steps after the crop from which on the guard trusts the run.
         patience: looks in a row that must fail.
         ratio: smallest share of the targets' spread that counts as alive.

@@ -23,7 +23,7 @@ class Watcher(Callback):
     Nothing that training reads may be changed.
 
     Args:
-        every_steps: steps between two histograms.
+        every_steps: steps between two looks.
     """
 
     def __init__(self, every_steps: int):
