@@ -28,7 +28,7 @@ def exporter_class(name: str) -> Any:
 
 
 def exporters_after_training(final: DictConfig) -> dict[str, Any]:
-    """Build the exporters that `final` names: `final.page=true`, or with settings `final.page.quality=small`.
+    """Build the exporters that `final` names: `final.page=true`, or with settings `final.page.seconds=30`.
 
     Raises:
         InputError: there is no such exporter or setting, or its value makes no sense.

@@ -4,9 +4,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
@@ -60,6 +62,14 @@ def require_setting(name: str, value: object, good: bool, rule: str) -> None:
     """Refuse a setting of an exporter that is not good: its name and value are said, and the rule."""
     if not good:
         raise InputError(f"what.{name}={value}: {rule}")
+
+
+def require_kernels(module: str, asked_by: str, cure: str = "Reinstall numba.") -> ModuleType:
+    """Return a module of compiled kernels, by its full name: without them the work would take hours."""
+    found = backend(module)
+    if found is None:
+        raise InputError(f"{asked_by} needs numba, which cannot be used here: {why_not(module)}. {cure}")
+    return found
 
 
 def refuse_ndc(record: SceneRecord, what: str) -> None:

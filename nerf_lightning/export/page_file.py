@@ -17,27 +17,29 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.export.baking.baked_field import BakedField, described, serialized
-from nerf_lightning.export.baking.cost import over
-from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.export.page_marks import Marks
+from nerf_lightning.export.splats.fitted import as_faces
+from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
+from nerf_lightning.export.splats.quantized import QuantizedSplats
+from nerf_lightning.export.splats.rasterizer import rasterize
+from nerf_lightning.export.splats.views import color_behind, without_lens
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import view_rays
 from nerf_lightning.nerf.rendering.blending import at_evaluation, photograph
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
-SCRIPTS = ("page.js", "path.js", "marks.js")
+SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
+SHADERS = ("splats.vert", "splats.frag")
 MARK = b"<!-- nerf_lightning page 1 -->"
+NEAR_NDC = 0.2  # Of the distance at which content begins.
+INSIDE = 0.01  # So large a share of the splats lies beyond either side of the box that one turns around.
 BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 STILL, PHOTOGRAPH = 640, 320  # Pixels of the longer side: of the still picture, of photographs.
 JPEG_QUALITY = 80
@@ -57,7 +59,8 @@ class ViewOnPage:
 
 def write_page(
     target: Path,
-    marcher: Marcher,
+    splats: QuantizedSplats,
+    focal: float,
     record: SceneRecord,
     beside: PageExtras,
     max_photographs: int,
@@ -66,12 +69,12 @@ def write_page(
     title: str | None = None,
     first_view: str | None = None,
 ) -> None:
-    """Write the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to.
+    """Write the page of splats, with what is known of them, and one to `max_photographs` places to jump to.
 
-    It begins with the view of `marks`, or the photograph, that is called `first_view`, which is one of them; None: with
-    the training view nearest to their average.
+    `focal` is that of the pictures that they were fitted to, in pixels. The view of `marks`, or the photograph, that is
+    called `first_view` is shown first; None: the training view nearest to their average.
     """
-    field = serialized(marcher.baked)
+    packed, shown = splats.packed(), splats.gaussians()
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
     names = [view["name"] for view in marks["views"]]
     if first_view in record.view_names and first_view not in names:
@@ -79,11 +82,13 @@ def write_page(
         first = record.view_names.index(first_view)
     else:
         first = average_view(record, views)
-    middle, radius = _middle(marcher.baked, record)
+    middle, radius = _middle(shown, record)
     up = functional.normalize(record.cameras.c2w[:, :, 1].mean(dim=0), dim=0)
-    about = described(marcher.baked) | {
-        "bytes": len(field),
-        "step": STEP,
+    about = splats.described() | {
+        "bytes": len(packed),
+        "focal": focal,
+        "near": _nearest(record),
+        "unbounded": record.space == "contracted",
         "cameras": [_camera(record.cameras, view) for view in views],
         "first": views.index(first),
         "first_view": names.index(first_view) if first_view in names else None,
@@ -93,24 +98,20 @@ def write_page(
         "middle": middle,
         "radius": radius,
         "up": up.tolist(),
-        "ndc": None if record.cameras.ndc is None else record.cameras.ndc[0].tolist(),
         "path": list(beside.keyframes),
         "to_user": record.to_user.tolist(),
         # A film has the shape of the first photograph.
         "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
     }
-    grid = f"{' x '.join(str(8 * count) for count in marcher.baked.shape)}, {about['blocks']:,} blocks of 8 x 8 x 8"
-    cameras = at_most(record.cameras, STILL)
-    rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, first))[0]
     page = {
         "title": title or beside.name or record.name,
-        "facts": [("scene", record.name), *beside.facts, *facts, ("grid", grid)],
+        "facts": [("scene", record.name), *beside.facts, *facts],
         "views": [_view(record, beside, view if max_photographs else None) for view in views],
-        "still": _jpeg(over(marcher.render(rays), record.background), STILL),
+        "still": _jpeg(_still(shown, record, first), STILL),
         "background": BEHIND[at_evaluation(record.background)],
     }
-    style, shader, *scripts = (
-        (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", "march.glsl", *SCRIPTS)
+    style, vertices, pixels, *scripts = (
+        (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", *SHADERS, *SCRIPTS)
     )
     script = "\n".join(scripts)
     # Nothing in a text may end the element that it stands in.
@@ -122,8 +123,9 @@ def write_page(
         about=Markup(about_text),
         script=Markup(script),
         style=Markup(style),
-        shader=Markup(shader),
-        field=Markup(base64.b64encode(field).decode()),
+        vertices=Markup(vertices),
+        pixels=Markup(pixels),
+        splats=Markup(base64.b64encode(packed).decode()),
     )
     with whole_file(target) as part:
         part.write_text(text, encoding="utf-8")
@@ -161,15 +163,26 @@ def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -
     return None if gap < WIDEST_GAP else math.radians(min(MOST_SWAY, (360.0 - gap) / 4))
 
 
-def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]:
+def _middle(splats: Gaussians, record: SceneRecord) -> tuple[list[float], float]:
     """Return what one turns around, and how far things are from it, in the world."""
     if record.space == "ndc":
         return [0.0, 0.0, -2.0], 1.0
-    contraction = baked.contraction
-    if contraction is not None:
-        return list(contraction.center), 3**0.5 * contraction.half
-    half = 0.5 * 8 * np.array(baked.spacing) * np.array(baked.shape)
-    return (np.array(baked.lower) + half).tolist(), float(np.linalg.norm(half))
+    lower, upper = record.aabb
+    if record.space == "bounded":
+        lower, upper = (torch.from_numpy(np.quantile(splats.means.numpy(), at, axis=0)) for at in (INSIDE, 1 - INSIDE))
+    return ((lower + upper) / 2).tolist(), float((upper - lower).norm() / 2)
+
+
+def _nearest(record: SceneRecord) -> float:
+    """Return how near, along the axis of a camera, splats are drawn."""
+    return NEAR_NDC if record.space == "ndc" else float(record.near.min())
+
+
+def _still(splats: Gaussians, record: SceneRecord, view: int) -> Float[Tensor, "height width 3"]:
+    if record.cameras.lens_model == "equirectangular":
+        record, view = as_faces(record), 6 * view
+    camera = Pinhole.of(without_lens(record.cameras, STILL), view, float(record.near[view]))
+    return rasterize(splats, camera, color_behind(record.background)).clamp(0, 1)
 
 
 def _camera(cameras: Cameras, view: int) -> dict[str, Any]:

@@ -35,12 +35,12 @@ def test_images_are_written_where_it_is_said(nerf, last, tmp_path):
 def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, finished_run, tmp_path):
     where = f"paths.output_dir={tmp_path}"
     result = nerf(
-        "export", f"ckpt={last}", "what=page", "what.resolution=16", "what.max_views=1", "what.fit_steps=3", where
+        "export", f"ckpt={last}", "what=page", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2", where
     )
     if result.code:  # 20 steps may leave a field without anything in it
-        said(result, "There is nothing to export")
+        said(result, "There is no surface to put splats on")
         return
-    assert "against the photographs of 1 test view" in result.out
+    assert "dB on 1 test view, the field" in result.out
     assert f"{tmp_path}/page.html" in result.out
     text = (tmp_path / "page.html").read_text()
     psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]
@@ -48,7 +48,6 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, f
     assert text.count('alt="ball_') + text.count('<button type="button" data-view') >= 8
     (tmp_path / "page.html").write_text("something else")
     said(nerf("export", f"ckpt={last}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR")
-    said(nerf("export", f"ckpt={last}", "what=page", "what.quality=huge", where), "what.quality=huge", "small, medium")
 
 
 def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs(nerf, last, capture, tmp_path):
@@ -65,14 +64,14 @@ def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs(nerf, last, 
 
 
 def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
-    given = ("what=page", "what.resolution=16", "what.max_views=1", "what.fit_steps=3")
+    given = ("what=page", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2")
     gone = ("scene=npz", f"scene.path={tmp_path}/gone.npz", f"paths.output_dir={tmp_path}")
     result = nerf("export", f"ckpt={last}", *given, *gone)
     if result.code:
-        said(result, "There is nothing to export")
+        said(result, "There is no surface to put splats on")
         return
     assert "and are left out: The file" in result.err
-    assert "against the photographs" not in result.out
+    assert "fitted to the field" in result.out
     assert 'class="without"' in (tmp_path / "page.html").read_text()
 
 
@@ -82,7 +81,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     unwritten = nerf("export", f"ckpt={last}", "what=page", "paths.output_dir=/dev/null/x")
     said(unwritten, "The output folder /dev/null/x cannot be written", "paths.output_dir=DIR")
     said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "page")
-    said(nerf("export", f"ckpt={last}", "what.quality=vast", where), "what.quality=vast is not valid", "small, medium")
+    said(nerf("export", f"ckpt={last}", "what.sh_degree=many", where), "what.sh_degree=many is not valid")
     assert not list(tmp_path.iterdir())
 
 

@@ -5,9 +5,9 @@ import os
 import re
 
 import pytest
-from support.baked_ball import all_around, record_of
 from support.measured_runs import leave_measured_run
 from support.running import FAST, refused, said
+from support.shiny_ball import all_around, record_of
 
 from nerf_lightning.commands.export import page_path
 from nerf_lightning.export.page import PageExport
@@ -37,11 +37,11 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     seen = {}
 
     def export(self, model, record, folder, tile_points):
-        seen.update(beside=self.beside, quality=self.quality, training=model.training)
+        seen.update(beside=self.beside, degree=self.sh_degree, training=model.training)
         (folder / "page.html").write_bytes(MARK)
         return [folder / "page.html"]
 
-    result = train(export, "final.page.quality=small", "final.cameras=true", "final.report=true")
+    result = train(export, "final.page.sh_degree=1", "final.cameras=true", "final.report=true")
     assert result.code == 0, result.err
     exported = tmp_path / "run" / "export"
     assert f"page         {exported}/page.html" in result.out
@@ -52,7 +52,7 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     last = result.out.splitlines()[-1]
     found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it: .+\."
     assert re.fullmatch(found, last), last
-    assert (seen["quality"], seen["training"]) == ("small", False)
+    assert (seen["degree"], seen["training"]) == (1, False)
     assert len(seen["beside"].photographs.view_names) == 10
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)
 
@@ -75,7 +75,7 @@ def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
     ("argument", "parts"),
     [
         ("final.page=huge", ("final.page=huge: give true, or settings", "final.page.KEY=VALUE")),
-        ("final.page.quality=huge", ("final.page: what.quality=huge", "small, medium, large")),
+        ("final.page.seconds=-1.0", ("final.page: what.seconds=-1.0", "0 or more")),
         ("final.page.size=3", ("final.page: nerf export has no setting what.size",)),
         ("final.pages=true", ("nerf train has no setting final.pages",)),
     ],

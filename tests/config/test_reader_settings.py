@@ -63,7 +63,7 @@ def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path, scene):
 
 def test_every_kernel_of_models_and_of_exporters_compiles():
     modules = kernel_modules()
-    assert {"nerf_lightning.nerf.kernels.march.cpu", "nerf_lightning.export.voxel_kernels.bounded"} <= set(modules)
+    assert {"nerf_lightning.nerf.kernels.march.cpu", "nerf_lightning.export.splats.tiles"} <= set(modules)
     assert all(backend(module) for module in modules)
 
 

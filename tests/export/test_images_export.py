@@ -82,7 +82,7 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(t
     ("exporter", "settings", "said"),
     [
         (ImagesExport, {"max_views": 0}, "what.max_views=0"),
-        (PageExport, {"resolution": 4}, "what.resolution=4: give 8 voxels or more"),
+        (PageExport, {"photographs": -1}, "what.photographs=-1: give 0 or more"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(exporter, settings, said):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.baked_ball import all_around, beside, read_baked, record_of, shiny_model
 from support.running import refused
+from support.shiny_ball import all_around, beside, read_page, record_of, shiny_model
 
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.page_file import average_view, sway
@@ -56,11 +56,11 @@ def test_a_file_that_is_none_is_refused(tmp_path, content, said):
 
 
 def exported(folder, **settings):
-    what = PageExport(resolution=16, photographs=2, max_views=0, fit_steps=0, **settings)
+    what = PageExport(300, 0.0, photographs=2, max_views=0, **settings)
     what.beside = beside(all_around())
     with torch.no_grad():
         what.export(shiny_model(), record_of(all_around()), folder, 4096)
-    return read_baked(folder / "page.html")[0]
+    return read_page(folder / "page.html")[0]
 
 
 def test_marks_are_kept_next_to_the_page_and_the_first_view_is_chosen(tmp_path):

@@ -6,9 +6,9 @@ import time
 import numpy as np
 import pytest
 import torch
-from support.baked_ball import RADIUS, all_around, beside, read_baked, record_of, shiny_model
 from support.browser import drag, opened
-from support.page_in_browser import marched, press, psnr, shot, wait_for, wait_until_there
+from support.page_in_browser import drawn, press, psnr, shot, wait_for, wait_until_there
+from support.shiny_ball import RADIUS, all_around, beside, read_page, record_of, shiny_model
 
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.nerf.geometry.frames import similarity
@@ -33,7 +33,7 @@ def page(tmp_path_factory):
     }
     (folder / "given.json").write_text(json.dumps(content))
     chosen = {"views": str(folder / "given.json"), "first_view": EVIL, "title": EVIL}
-    what = PageExport("small", 32, photographs=6, max_views=0, fit_steps=0, **chosen)
+    what = PageExport(2000, 1.0, photographs=6, max_views=0, **chosen)
     what.beside = beside(scene)
     to_user = similarity(torch.eye(3), torch.tensor([5.0, 0.0, 0.0]), 3.0)
     with torch.no_grad():
@@ -51,7 +51,7 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
         run("document.body.classList.add('bare')")
         found = shot(driver)
         height, width = found.shape[:2]
-        assert psnr(found, marched(page, 2, width, height)) > 38
+        assert psnr(found, drawn(page, 2, width, height)) > 38
         run("window.prompt = () => 'mine'")
         press(driver, "v")
         press(driver, "n")
@@ -74,14 +74,14 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
     for key, value in saved["views"][0].items():
         if key != "name":
             np.testing.assert_allclose(saved["views"][1][key], value, rtol=1e-6, atol=1e-6)
-    eye = np.array(read_baked(page)[0]["cameras"][2]["eye"])
+    eye = np.array(read_page(page)[0]["cameras"][2]["eye"])
     point = (np.array(saved["notes"][1]["position"]) - [5.0, 0.0, 0.0]) / 3
     # On the side of the ball, which is soft, that the camera sees.
     assert np.linalg.norm(point) == pytest.approx(RADIUS, abs=0.2)
     assert point @ eye / np.linalg.norm(point) / np.linalg.norm(eye) > 0.999
     assert saved["distances"] == []
     # Thirty pixels at about the distance of the surface; it curves away from the camera.
-    focal = read_baked(page)[0]["cameras"][2]["focal"][0] * min(width, height) / 32
+    focal = read_page(page)[0]["cameras"][2]["focal"][0] * min(width, height) / 32
     across = 0.03 * 30 / focal * (np.linalg.norm(eye) - np.linalg.norm(point))
     assert float(told.removesuffix(" m")) == pytest.approx(across, rel=0.15)
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import torch
-from support.baked_ball import RADIUS, all_around, record_of, shiny_model
 from support.known_fields import ball
+from support.shiny_ball import RADIUS, all_around, shiny_model
 
 DENSE = 5.0
 """So far out the fog has half its density, of 100 inside of the ball; at 3 it stops most of the light."""
@@ -25,7 +25,3 @@ def hall_model():
         return torch.minimum(0.2 * ball(RADIUS)(positions), 0.02 * (DENSE - positions.norm(dim=-1)))
 
     return shiny_model(soft)
-
-
-def hall_record():
-    return record_of(hall_scene())

@@ -1,18 +1,17 @@
-"""An exported page in a browser: waiting for it, keys, pictures of it, and what its file shows by the marcher."""
+"""An exported page in a browser: waiting for it, keys, pictures of it, and what its file shows by the rasterizer."""
 
 import io
 import time
+from unittest import mock
 
 import numpy as np
 import torch
 from PIL import Image
-from support.baked_ball import read_baked
+from support.shiny_ball import read_page
 
-from nerf_lightning.export.baking.cost import over
-from nerf_lightning.export.baking.marcher import Marcher
-from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import view_rays
+from nerf_lightning.export.splats.gaussians import Pinhole
+from nerf_lightning.export.splats.reference import rasterize
+from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 
 STATE = "return document.body.dataset.state"
 MESSAGE = "return document.getElementById('message').textContent"
@@ -34,20 +33,21 @@ def press(driver, key: str) -> None:
     driver.execute_script(f"document.body.dispatchEvent({event})", key)
 
 
-def marched(page, view: int, width: int, height: int, behind="white") -> np.ndarray:
+def drawn(page, view: int, width: int, height: int, behind=1.0) -> np.ndarray:
     """What the file shows through a camera in a window, its picture in the middle."""
-    lens = read_baked(page)[0]["cameras"][view]
+    lens = read_page(page)[0]["cameras"][view]
     c2w = torch.tensor([*lens["axes"], lens["eye"]]).T
-    return marched_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height, behind)
+    return drawn_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height, behind)
 
 
-def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
-    about, baked = read_baked(page)
+def drawn_through(page, c2w, focal, size, width, height, behind=1.0) -> np.ndarray:
+    about, splats = read_page(page)
     small, large = sorted((width / size[0], height / size[1]))
-    scale = small * (large / small) ** (1 / 3 if about["contraction"] else 0)
-    cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
-    rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), all_pixels(cameras, 0))
-    return over(Marcher(baked).render(rays), behind).clamp(0, 1).numpy()
+    scale = small * (large / small) ** (1 / 3 if about["unbounded"] else 0)
+    camera = Pinhole.of(pinhole_cameras(c2w[None].float(), scale * float(focal), width, height), 0, about["near"])
+    dilation = 0.3 * max(1.0, scale * float(focal) / about["focal"]) ** 2
+    with mock.patch("nerf_lightning.export.splats.gaussians.DILATION", dilation):
+        return rasterize(splats, camera, torch.full((3,), behind)).clamp(0, 1).numpy()
 
 
 def psnr(one, other) -> float:

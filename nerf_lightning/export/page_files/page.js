@@ -1,6 +1,5 @@
 "use strict";
 
-const SIDE = 8, TILE = 9, NO_CHANGE = 128;
 const byId = (id) => document.getElementById(id);
 
 // What is said to a person, in place of the scene.
@@ -21,8 +20,8 @@ function readAbout() {
   return JSON.parse(element.textContent);
 }
 
-async function readField(about) {
-  const element = byId("field");
+async function readScene(about) {
+  const element = byId("splats");
   const text = element === null ? "" : element.textContent;
   const expected = 4 * Math.ceil(about.bytes / 3);
   if (text.length !== expected) {
@@ -32,218 +31,27 @@ async function readField(about) {
   if (!("DecompressionStream" in window)) {
     throw new Refusal("This browser is too old to unpack the scene: use one of 2023 or later.");
   }
-  let bytes;
   try {
     const raw = atob(text);
     element.remove();
     const packed = new Uint8Array(raw.length);
     for (let i = 0; i < raw.length; i++) packed[i] = raw.charCodeAt(i);
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-    bytes = await new Response(stream).arrayBuffer();
+    return new Uint8Array(await new Response(stream).arrayBuffer());
   } catch (error) {
     throw new Refusal("The scene in this file is damaged: it cannot be unpacked. Fetch the file again.");
   }
-  return partsOf(about, bytes);
 }
 
-function partsOf(about, bytes) {
-  const values = SIDE ** 3 * about.blocks;
-  const sizes = [4 * about.blocks, values, values / 8, 3 * about.harmonics * about.colored];
-  if (bytes.byteLength !== sizes.reduce((sum, size) => sum + size)) {
-    throw new Refusal("The scene in this file is damaged: it does not have the size that it says. Fetch it again.");
-  }
-  const starts = sizes.map((_, i) => sizes.slice(0, i).reduce((sum, size) => sum + size, 0));
-  const [numbers, density, mask, colors] = starts.map((start, i) => new Uint8Array(bytes, start, sizes[i]));
-  return { numbers: new Int32Array(bytes, numbers.byteOffset, about.blocks), density, mask, colors };
-}
-
-// ---- Tiles: blocks with the first values of the next ones -------------------------------------------------------
-
-function indexOf(about, numbers) {
-  const index = new Int32Array(about.shape[0] * about.shape[1] * about.shape[2]).fill(-1);
-  numbers.forEach((number, block) => { index[number] = block; });
-  return index;
-}
-
-function neighboursOf(about, numbers, index) {
-  const [nx, ny, nz] = about.shape, found = new Int32Array(8 * numbers.length);
-  numbers.forEach((number, block) => {
-    const x = Math.floor(number / (ny * nz)), y = Math.floor(number / nz) % ny, z = number % nz;
-    for (let corner = 0; corner < 8; corner++) {
-      const [i, j, k] = [x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)];
-      found[8 * block + corner] = i < nx && j < ny && k < nz ? index[(i * ny + j) * nz + k] : -1;
-    }
-  });
-  return found;
-}
-
-// Every place of a tile: in which of the eight blocks it lies, and where there.
-const PLACES = Array.from({ length: TILE ** 3 }, (_, place) => {
-  const at = [Math.floor(place / TILE ** 2), Math.floor(place / TILE) % TILE, place % TILE];
-  const corner = at.reduce((sum, each) => 2 * sum + (each === SIDE ? 1 : 0), 0);
-  return [corner, at.reduce((sum, each) => SIDE * sum + each % SIDE, 0), at];
-});
-
-function fillChannel(into, channel, values, empty, neighbours, blocks, atlas) {
-  const width = TILE * atlas[0], slice = width * TILE * atlas[1];
-  const offsets = PLACES.map(([, , [a, b, c]]) => 4 * (a * slice + b * width + c) + channel);
-  for (let block = 0; block < blocks; block++) {
-    const column = block % atlas[0], row = Math.floor(block / atlas[0]) % atlas[1];
-    const layer = Math.floor(block / (atlas[0] * atlas[1]));
-    const start = 4 * TILE * (layer * slice + row * width + column);
-    for (let place = 0; place < PLACES.length; place++) {
-      const other = neighbours[8 * block + PLACES[place][0]];
-      into[start + offsets[place]] = other < 0 ? empty : values[SIDE ** 3 * other + PLACES[place][1]];
-    }
-  }
-}
-
-function spread(channel, field, colored, empty) {
-  const values = new Uint8Array(field.density.length).fill(empty);
-  let next = channel * colored;
-  for (let place = 0; place < values.length; place++) {
-    if (field.mask[place >> 3] >> (place & 7) & 1) values[place] = field.colors[next++];
-  }
-  return values;
-}
-
-function atlasOf(blocks, most) {
-  const across = Math.min(Math.ceil(Math.cbrt(blocks)), Math.floor(most / TILE));
-  const down = Math.min(across, Math.ceil(blocks / across));
-  const deep = Math.ceil(blocks / (across * down));
-  if (deep * TILE > most) {
-    throw new Refusal("This device cannot hold a scene of this size. Ask for the file of a smaller quality (what.quality=small).");
-  }
-  return [across, down, deep];
-}
-
-// ---- The picture -------------------------------------------------------------------------------------------------
+// ---- The lens ----------------------------------------------------------------------------------------------------
 
 // Focal length and principal point of a view's lens, whose picture fits into the window, its middle in the window's. Of
 // scenes without bounds, where nothing is known beyond the photographs' edges, it fills a part of what would stay empty.
 function lensIn({ lens, about }, width, height) {
   const fits = [width / lens.width, height / lens.height], least = Math.min(...fits), middle = [width / 2, height / 2];
-  const scale = about.contraction ? least * Math.cbrt(Math.max(...fits) / least) : least;
+  const scale = about.unbounded ? least * Math.cbrt(Math.max(...fits) / least) : least;
   const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
   return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
-}
-
-const NAMES = ["base", "more0", "more1", "more2", "more3", "more4", "more5"];
-
-class Picture {
-  constructor(about, field) {
-    this.about = about;
-    this.canvas = byId("scene");
-    const gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-    if (gl === null) {
-      throw new Refusal("This browser does not have WebGL2, so the scene cannot be turned: here is a still picture of it. Current versions of Chrome, Firefox and Safari have it.");
-    }
-    this.gl = gl;
-    this.atlas = atlasOf(about.blocks, gl.getParameter(gl.MAX_3D_TEXTURE_SIZE));
-    this.program = this.linked();
-    gl.useProgram(this.program);
-    gl.disable(gl.DITHER);
-    this.upload(field);
-    this.fix();
-  }
-
-  linked() {
-    const gl = this.gl, program = gl.createProgram();
-    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}${this.about.contraction ? "#define CONTRACTED\n" : ""}${this.about.closed ? "#define CLOSED\n" : ""}`;
-    const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
-    for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, head + byId("shader").textContent]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, text);
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getShaderInfoLog(shader)}`);
-      gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getProgramInfoLog(program)}`);
-    return program;
-  }
-
-  at(name) { return this.gl.getUniformLocation(this.program, name); }
-
-  texture(unit, name, filter, ...image) {
-    const gl = this.gl;
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_3D, key, filter);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) gl.texParameteri(gl.TEXTURE_3D, key, gl.CLAMP_TO_EDGE);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.texImage3D(gl.TEXTURE_3D, 0, ...image);
-    gl.uniform1i(this.at(name), unit);
-  }
-
-  upload(field) {
-    const gl = this.gl, about = this.about, [nx, ny, nz] = about.shape;
-    const index = indexOf(about, field.numbers), neighbours = neighboursOf(about, field.numbers, index);
-    this.texture(0, "index", gl.NEAREST, gl.R32I, nz, ny, nx, 0, gl.RED_INTEGER, gl.INT, index);
-    const size = this.atlas.map((count) => TILE * count), channels = 3 * about.harmonics;
-    for (let unit = 0; 4 * unit <= channels; unit++) {
-      const bytes = new Uint8Array(4 * size[0] * size[1] * size[2]);
-      const fill = (into, values, empty) => fillChannel(bytes, into, values, empty, neighbours, about.blocks, this.atlas);
-      for (let into = 0; into < 4; into++) {
-        const channel = unit === 0 ? into : 4 * unit - 1 + into, empty = channel < 3 ? 0 : NO_CHANGE;
-        if (unit === 0 && into === 3) fill(3, field.density, 0);
-        else if (channel < channels) fill(into, spread(channel, field, about.colored, empty), empty);
-      }
-      this.texture(unit + 1, NAMES[unit], gl.LINEAR, gl.RGBA8, ...size, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-    }
-    if (gl.getError() !== gl.NO_ERROR) throw new Refusal("This device has too little graphics memory for the scene. Ask for the file of a smaller quality (what.quality=small).");
-  }
-
-  fix() {
-    const gl = this.gl, about = this.about;
-    gl.uniform3iv(this.at("shape"), about.shape);
-    gl.uniform3iv(this.at("atlas"), this.atlas);
-    gl.uniform3fv(this.at("lower"), about.lower);
-    gl.uniform3fv(this.at("spacing"), about.spacing);
-    gl.uniform1f(this.at("voxel"), about.length);
-    gl.uniform1f(this.at("step_length"), about.step);
-    gl.uniform2fv(this.at("exponents"), about.exponents);
-    gl.uniform2fv(this.at("ranges"), about.ranges);
-    if (about.ndc) gl.uniform2fv(this.at("ndc"), about.ndc);
-    if (about.contraction) {
-      gl.uniform3fv(this.at("middle"), about.contraction.center);
-      gl.uniform1f(this.at("half_side"), about.contraction.half);
-      gl.uniform1f(this.at("nearest"), about.contraction.near);
-    }
-  }
-
-  // `share` of the window's pixels along each side.
-  draw(view, share) {
-    const ratio = share * window.devicePixelRatio;
-    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
-    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
-    if (this.canvas.width !== width) this.canvas.width = width;
-    if (this.canvas.height !== height) this.canvas.height = height;
-    this.trace(view, lensIn(view, width, height), width, height, view.shown);
-  }
-
-  // How far away the surface is at a place of the window (in pixels of CSS), along the ray; 0: there is none.
-  depth(view, x, y) {
-    const gl = this.gl, bytes = new Uint8Array(4), { focal, center } = lensIn(view, innerWidth, innerHeight);
-    this.trace(view, { focal, center: [center[0] - x + 0.5, center[1] - y + 0.5] }, 1, 1, 3);
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-    return new Float32Array(new Uint8Array([0, ...bytes.slice(0, 3)]).buffer)[0];
-  }
-
-  trace(view, { focal, center }, width, height, shown) {
-    const gl = this.gl;
-    gl.viewport(0, 0, width, height);
-    gl.uniform1f(this.at("height"), height);
-    gl.uniform2fv(this.at("focal"), focal);
-    gl.uniform2fv(this.at("center"), center);
-    gl.uniform3fv(this.at("eye"), view.eye);
-    gl.uniformMatrix3fv(this.at("turn"), false, view.axes.flat());
-    gl.uniform3fv(this.at("behind"), view.behind);
-    gl.uniform1i(this.at("shown"), shown);
-    const away = length(minus(view.eye, this.about.middle));
-    gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-  }
 }
 
 // ---- Where one looks from: an eye, three axes (right, up, back), and what it turns around ------------------------
@@ -546,7 +354,7 @@ function listenToControls(frames) {
 
 async function start() {
   try {
-    const about = readAbout(), picture = new Picture(about, await readField(about));
+    const about = readAbout(), picture = new Picture(about, await readScene(about));
     const frames = new Frames(picture, new View(about));
     picture.canvas.addEventListener("webglcontextlost", () => tell("The graphics of this device gave up. Open the page again."));
     listenToPointers(picture.canvas, frames);

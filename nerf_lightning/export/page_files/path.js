@@ -3,6 +3,21 @@
 const LEG = 2;  // seconds from a named view to the next
 const POINTS = ["position", "look_at", "up"];
 
+// Rotations of keyframes as unit quaternions (w, x, y, z), each with the sign that is nearer to the one before.
+function quaternionsOf(keys) {
+  let before = [1, 0, 0, 0];
+  return keys.map(({ position, look_at, up }) => {
+    const back = unit(minus(position, look_at)), right = unit(cross(up, back)), [a, b, c] = [right, cross(back, right), back];
+    const [x, y, z] = [b[2] - c[1], c[0] - a[2], a[1] - b[0]], [p, q, r] = [a[1] + b[0], c[0] + a[2], b[2] + c[1]];
+    const rows = [
+      [1 + a[0] + b[1] + c[2], x, y, z], [x, 1 + a[0] - b[1] - c[2], p, q],
+      [y, p, 1 - a[0] + b[1] - c[2], r], [z, q, r, 1 - a[0] - b[1] + c[2]],
+    ];
+    const found = unit(rows.reduce((best, row) => (length(row) > length(best) ? row : best)));
+    return before = dot(found, before) < 0 ? found.map((each) => -each) : found;
+  });
+}
+
 // The curve through values at increasing times that nerf render takes: cubic, Catmull and Rom's tangents.
 function hermite(times, values, at) {
   const leg = Math.max(0, Math.min(times.length - 2, times.findLastIndex((time) => time <= at)));
@@ -59,7 +74,9 @@ class CameraPath {
   show(view, seconds) {
     const keys = this.keyframes, times = keys.map((key) => key.time);
     const along = (value) => hermite(times, keys.map(value), seconds);
-    const [position, look_at, up] = POINTS.map((name) => along((key) => key[name]));
+    const [position, look_at] = POINTS.slice(0, 2).map((name) => along((key) => key[name]));
+    const [w, x, y, z] = unit(hermite(times, quaternionsOf(keys), seconds));
+    const up = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)];
     const tangent = Math.exp(along((key) => [Math.log(Math.tan(key.fov * Math.PI / 360))])[0]);
     this.look(view, { position, look_at, up, fov: 360 * Math.atan(tangent) / Math.PI });
   }

@@ -9,8 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerf_lightning.export.base import require_kernels
 from nerf_lightning.export.density_grid import Lattice, Report
-from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.extensions.geometry_exports.density_mesh import marching_cubes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
@@ -41,7 +41,9 @@ def mesh_of_depth(
 
     `truncation` says how far before and behind a surface its distance is kept, in cells.
     """
-    fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or use what.surface=density.", __package__)
+    fuse = require_kernels(
+        f"{__package__}.tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or use what.surface=density."
+    )
     lower, reach = lattice.lower.numpy(), truncation * lattice.spacing
     distance, weight = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
     rays_of = depth_rays(record, max(lattice.shape))

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.compute.machine import require_memory
+from nerf_lightning.export.base import require_kernels
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.extensions.geometry_exports.surface import short_rays
 from nerf_lightning.messages.errors import InputError
@@ -78,7 +78,7 @@ def make_atlas(vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "face
 def find_texels(atlas: Atlas, size: int) -> Texels:
     """Return the texels whose centers the charts cover."""
     cure = "Reinstall numba, or leave what.texture=true out for a color per vertex."
-    texels = kernels("texels", "what.texture=true", cure, __package__)
+    texels = require_kernels(f"{__package__}.texels", "what.texture=true", cure)
     down = np.stack([atlas.uv[:, 0], 1.0 - atlas.uv[:, 1]], axis=1) * size
     face, shares = texels.covered_texels(down[atlas.faces], size)
     row, column = np.nonzero(face >= 0)

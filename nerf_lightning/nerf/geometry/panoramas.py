@@ -78,3 +78,24 @@ def panorama_cameras(c2w: Float[Tensor, "views 3 4"], width: int, height: int) -
         width=torch.full((views,), width, dtype=torch.int64, device=c2w.device),
         height=torch.full((views,), height, dtype=torch.int64, device=c2w.device),
     )
+
+
+def faces_of_panoramas(panoramas: Cameras) -> Cameras:
+    """Return six pinhole cameras for each panorama, the faces of a cube: front, left, back, right, top and bottom."""
+    around = [[[c, 0, s], [0, 1, 0], [-s, 0, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    above = [[[1, 0, 0], [0, 0, -s], [0, s, 0]] for s in (1, -1)]
+    turns = panoramas.c2w.new_tensor(around + above)
+    c2w = torch.cat(
+        [panoramas.c2w[:, None, :, :3] @ turns, panoramas.c2w[:, None, :, 3:].expand(-1, 6, -1, -1)], dim=-1
+    )
+    side = (panoramas.height // 2).clamp(min=1).repeat_interleave(6)
+    half = (0.5 * side)[:, None].expand(-1, 2).to(c2w)
+    return Cameras(
+        c2w=c2w.flatten(0, 1),
+        focal=half.clone(),
+        center=half.clone(),
+        lens=torch.zeros_like(panoramas.lens).repeat_interleave(6, dim=0),
+        lens_model="pinhole",
+        width=side,
+        height=side.clone(),
+    )

@@ -10,7 +10,7 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.voxel_kernels import layout
+from nerf_lightning.export import base
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.extensions.geometry_exports.points import PointsExport
 from nerf_lightning.extensions.geometry_exports.volume import VolumeExport
@@ -90,7 +90,7 @@ def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, library
 
 
 def test_without_numba_a_fused_surface_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(layout, "backend", lambda module: None)
+    monkeypatch.setattr(base, "backend", lambda module: None)
     with pytest.raises(InputError, match=r"what\.surface=tsdf needs numba.*use what\.surface=density"):
         exported(tmp_path, MeshExport(16, "tsdf"))
 

@@ -1,0 +1,60 @@
+"""A ball whose color depends on where it is seen from, and its page."""
+
+import base64
+import gzip
+import json
+import re
+from dataclasses import fields, replace
+
+import numpy as np
+from support.known_fields import SolidField, ball
+from support.scenes import ball_scene
+
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.export.base import PageExtras
+from nerf_lightning.export.splats.gaussians import Gaussians
+from nerf_lightning.export.splats.quantized import QuantizedSplats
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.types.renderings import FieldOutput
+
+RADIUS = 0.6
+
+
+class ShinyField(SolidField):
+    """Its color is its place, and its side that one looks from."""
+
+    def forward(self, points, features=None):
+        rgb = 0.5 + 0.3 * points.positions + 0.2 * points.directions
+        return FieldOutput(self.density(points)[0], rgb.clamp(0, 1))
+
+
+def shiny_model(distance=None, **settings) -> RadianceModel:
+    soft = distance or (lambda positions: 0.2 * ball(RADIUS)(positions))
+    field = ShinyField(soft, **({"inside": 100.0} | settings))
+    return RadianceModel({"fine": DenseLevel(StratifiedSampler(256), field)}).eval()
+
+
+def all_around(size: int = 32, **changes):
+    """The scene, all of whose views train and test."""
+    views = tuple(range(6))
+    return replace(ball_scene(num_views=6, size=size), splits={"train": views, "test": views}, **changes)
+
+
+def record_of(scene, **changes):
+    return replace(scene_record(scene), **changes)
+
+
+def beside(scene, *facts) -> PageExtras:
+    return PageExtras(scene, facts=tuple(facts))
+
+
+def read_page(page) -> tuple[dict, Gaussians]:
+    """What a page says of its scene, and the splats in it."""
+    text = page.read_text()
+    about, packed = (re.search(rf'id="{name}">([^<]*)</script>', text)[1] for name in ("about", "splats"))
+    about, planes = json.loads(about), np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
+    known = {field.name: about[field.name] for field in fields(QuantizedSplats) if field.name != "content"}
+    known |= {name: tuple(known[name]) for name in ("scales", "colors")}
+    return about, QuantizedSplats(**known, content=planes.reshape(-1, about["splats"])).gaussians()
