@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from support.shiny_ball import read_page
 
+from nerf_lightning.export.splats import gaussians
 from nerf_lightning.export.splats.gaussians import Pinhole
 from nerf_lightning.export.splats.reference import rasterize
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
@@ -45,8 +46,8 @@ def drawn_through(page, c2w, focal, size, width, height, behind=1.0) -> np.ndarr
     small, large = sorted((width / size[0], height / size[1]))
     scale = small * (large / small) ** (1 / 3 if about["unbounded"] else 0)
     camera = Pinhole.of(pinhole_cameras(c2w[None].float(), scale * float(focal), width, height), 0, about["near"])
-    dilation = 0.3 * max(1.0, scale * float(focal) / about["focal"]) ** 2
-    with mock.patch("nerf_lightning.export.splats.gaussians.DILATION", dilation):
+    dilation = gaussians.DILATION * max(1.0, scale * float(focal) / about["focal"]) ** 2
+    with mock.patch.object(gaussians, "DILATION", dilation):
         return rasterize(splats, camera, torch.full((3,), behind)).clamp(0, 1).numpy()
 
 

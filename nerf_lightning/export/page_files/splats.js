@@ -1,7 +1,7 @@
 // ---- The scene as 3D Gaussian splats (Kerbl et al. 2023), drawn from the farthest to the nearest ----------------
 
 const BUCKETS = 1 << 16;  // Of distances, by their logarithms.
-const DILATION = 0.3;     // Pixels^2 of the photographs, as in gaussians.py.
+const DILATION = 0.1;     // Pixels^2 of the photographs, as in gaussians.py.
 
 // The planes of bytes of quantized.py: places, and for each splat texels of quaternion, sizes and opacity, color, harmonics.
 function splatsOf(about, content) {

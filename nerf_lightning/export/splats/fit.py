@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.export.splats.gaussians import Gaussians
+from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.views import View, color_behind
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
@@ -32,6 +32,8 @@ UNTIL = 0.7  # and the share of the time in which there are any.
 LEAST_OPACITY = 0.005  # What is less opaque goes.
 GROWTH = 0.1  # At most so many are split in one round, as a share of all.
 SMALLER = 1.6  # By which the two parts of a splat are smaller than it.
+LEAST_VARIANCE = 0.15
+"""Pixels^2 along each axis of a splat (arXiv 2311.16493, Sec. 5.1): thinner ones vanish in larger pictures."""
 
 
 @dataclass
@@ -55,7 +57,8 @@ def fit(
 
     One in `TAUGHT_EVERY` is the field's, which knows what no photograph shows; all, where there are no photographs.
     """
-    state, generator = _State(gaussians, fitting.extent), torch.Generator().manual_seed(fitting.seed)
+    cameras = [view.camera for view in photographs or taught]
+    state, generator = _State(gaussians, fitting.extent, cameras), torch.Generator().manual_seed(fitting.seed)
     began, step = time.monotonic(), 0
     photographed, shown = _in_random_order(photographs, generator), _in_random_order(taught, generator)
     with torch_on_one_thread():
@@ -84,11 +87,13 @@ def _background(background: Background, generator: torch.Generator) -> Float[Ten
 class _State:
     """Splats that learn: their moments, and what the screen says of each."""
 
-    def __init__(self, gaussians: Gaussians, extent: float):
+    def __init__(self, gaussians: Gaussians, extent: float, cameras: Sequence[Pinhole]):
         self.gaussians = gaussians.map(lambda each: each.clone().requires_grad_())
         self.rates = RATES | {"means": MEANS_RATE * extent}
         self.first, self.second = (gaussians.map(torch.zeros_like) for _ in range(2))
         self.step, self.error = 0, torch.zeros(len(gaussians))
+        self.eyes, self.pixels = torch.stack([camera.eye for camera in cameras]), [1 / c.focal[0] for c in cameras]
+        self.finest = self._finest(gaussians)
 
     def learn(self, view: View, background: Float[Tensor, "3"], rate: float) -> float:
         """Take one step of Adam, and return the loss."""
@@ -109,7 +114,13 @@ class _State:
             step_size = rate * self.rates[name] / (1 - b1**self.step)
             adam_step(tensor.detach(), tensor.grad, first, second, step_size, root_scale, BETAS, EPS)
             tensor.grad = None
+        self.gaussians.log_scales.detach().clamp_(min=self.finest[:, None])
         return float(loss.detach())
+
+    def _finest(self, gaussians: Gaussians) -> Float[Tensor, "n"]:
+        """Return the least logarithm of each splat's standard deviations: `LEAST_VARIANCE` to the nearest camera."""
+        pixels = torch.cdist(gaussians.means.detach(), self.eyes) * torch.tensor(self.pixels)
+        return pixels.amin(dim=-1).clamp(min=1e-12).log() + 0.5 * math.log(LEAST_VARIANCE)
 
     def refine(self, budget: int, generator: torch.Generator) -> None:
         """Prune what is transparent, and split what moves most on the screen, up to the budget."""
@@ -133,4 +144,4 @@ class _State:
             return torch.cat([moment[kept], moment.new_zeros(2 * len(split), *moment.shape[1:])])
 
         self.first, self.second = self.first.map(with_new), self.second.map(with_new)
-        self.error = torch.zeros(len(self.gaussians))
+        self.error, self.finest = torch.zeros(len(self.gaussians)), self._finest(self.gaussians)

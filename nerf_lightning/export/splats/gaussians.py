@@ -18,8 +18,11 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, Spherical
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras
 
-DILATION = 0.3
-"""Pixels^2 that viewers of splats add to each covariance on the screen, so that none falls between two pixels."""
+DILATION = 0.1
+"""Pixels^2 that are added to each covariance on the screen, so that no splat falls between two pixels.
+
+Viewers add 0.3 whatever the picture's size: as much as this in one 1.7 times as large as those fitted to.
+"""
 LEAST_ALPHA, LARGEST_ALPHA = 1.0 / 255.0, 0.99
 """What is less opaque is not drawn, and nothing is more opaque."""
 LEAST_LIGHT = 1e-4
@@ -105,7 +108,7 @@ def covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
 
 
 def project(gaussians: Gaussians, camera: Pinhole) -> Projected:
-    """Return the splats on the screen: J W S W^T J^T + 0.3 I (EWA, Zwicker et al. 2001; Eq. 5, arXiv 2308.04079)."""
+    """Return the splats on the screen: J W S W^T J^T + DILATION I (EWA, Zwicker et al. 2001; Eq. 5, arXiv 2308.04079)."""
     local = (gaussians.means - camera.eye) @ camera.rotation.mT
     x, y, z = local.unbind(dim=-1)
     (fx, fy), (cx, cy) = camera.focal, camera.center

@@ -44,8 +44,8 @@ camera.projectionMatrix.fromArray(about.projection);
 camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
 camera.applyMatrix4(new THREE.Matrix4().fromArray(about.c2w));
 const splats = new SplatMesh({ url: file }); if (turned) splats.quaternion.set(1, 0, 0, 0);
-// The dilation of 3DGS; Spark's own default dims small splats as it widens them.
-scene.add(new SparkRenderer({ renderer, preBlurAmount: 0.3, blurAmount: 0.0 }), splats);
+// Our dilation; Spark's own default dims small splats as it widens them.
+scene.add(new SparkRenderer({ renderer, preBlurAmount: 0.1, blurAmount: 0.0 }), splats);
 await splats.initialized;
 for (let frame = 0; frame < 20; frame++) {
   renderer.render(scene, camera); await new Promise(done => setTimeout(done, 100));

@@ -8,7 +8,7 @@ import torch
 from support.some_splats import camera, some
 from torch.nn.functional import normalize
 
-from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole, dc_of_color, project
+from nerf_lightning.export.splats.gaussians import DILATION, Gaussians, Pinhole, dc_of_color, project
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.reference import rasterize as reference
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion as rotations
@@ -36,7 +36,7 @@ def joined(*parts):
 
 def test_one_splat_on_the_axis():
     """Its standard deviation is 30 * 0.1 / 2 = 1.5 pixels; the middle pixel's center is where its mean is."""
-    variance = 1.5**2 + 0.3
+    variance = 1.5**2 + DILATION
     for draw in (rasterize, reference):
         picture = draw(splat(), camera(), BLACK)
         torch.testing.assert_close(picture[10, 16], torch.tensor([0.5, 0.0, 0.0]), atol=1e-5, rtol=0)
@@ -60,7 +60,7 @@ def test_what_is_behind_the_camera_too_near_or_outside_is_not_drawn(hidden):
 
 def test_a_needle_and_a_point_are_as_wide_as_the_dilation():
     thin = splat(scale=[0.5, 1e-12, 1e-12])
-    assert project(thin, camera()).conics[0, 2].item() == pytest.approx(1 / 0.3, rel=1e-3)
+    assert project(thin, camera()).conics[0, 2].item() == pytest.approx(1 / DILATION, rel=1e-3)
     for tiny in (thin, splat(scale=0.0)):
         torch.testing.assert_close(
             rasterize(tiny, camera(), BLACK), reference(tiny, camera(), BLACK), atol=1e-5, rtol=0

@@ -18,6 +18,7 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export import base
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.export.splats.export import SplatsExport
+from nerf_lightning.export.splats.fit import LEAST_VARIANCE
 from nerf_lightning.export.splats.views import photographed, without_lens
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
@@ -177,3 +178,16 @@ def test_the_command_finds_the_exporter_and_says_what_was_written(nerf, tmp_path
     result = nerf("export", f"ckpt={tiny}", "what=splats", "what.num_splats=0", out)
     said(result, "what.num_splats=0: give 1 to 3,000,000")
     assert not (tmp_path / "out").exists()
+
+
+def test_no_splat_is_thinner_than_the_pixels_of_the_nearest_photograph(tmp_path):
+    scene, model = photographed_ball(32)
+    _, (path, *_) = exported(tmp_path, model, scene, seconds=1.0, frame="capture")
+    header = path.read_bytes().partition(b"end_header")[0].decode().splitlines()
+    names = [line.split()[-1] for line in header if line.startswith("property")]
+    rows = rows_of(path)
+    thinnest = np.exp(rows[:, names.index("scale_0") : names.index("scale_2") + 1].min(axis=1))
+    apart = np.linalg.norm(rows[:, None, :3] - scene.cameras.c2w[:, :, 3].numpy(), axis=-1).min(axis=1)
+    pixels = apart / float(scene.cameras.focal[0, 0])
+    assert (thinnest > 0.9 * LEAST_VARIANCE**0.5 * pixels).all()  # means move a little after the last split
+    assert (thinnest < 2.0 * pixels).mean() > 0.5
