@@ -124,7 +124,7 @@ class View {
 
 // ---- Frames: coarse while something moves, as fine as the screen when nothing does -------------------------------
 
-const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.15;
+const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.4;
 const TURN = 24;  // seconds for once around, or to and fro
 
 class Frames {

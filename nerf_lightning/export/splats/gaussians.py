@@ -108,7 +108,7 @@ def covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
 
 
 def project(gaussians: Gaussians, camera: Pinhole) -> Projected:
-    """Return the splats on the screen: J W S W^T J^T + DILATION I (EWA, Zwicker et al. 2001; Eq. 5, arXiv 2308.04079)."""
+    """Return the splats on the screen: J W S W^T J^T + DILATION (EWA, Zwicker et al. 2001; Eq. 5, arXiv 2308.04079)."""
     local = (gaussians.means - camera.eye) @ camera.rotation.mT
     x, y, z = local.unbind(dim=-1)
     (fx, fy), (cx, cy) = camera.focal, camera.center
