@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 class BlenderReader(GivenFrameReader):
     """Read a folder of the Blender format.
 
-    A missing val split is held out from train, every 8th view. A missing test split is judged on val.
+    If one of val and test is missing, the other serves as both; without either, every 8th train view is held out.
 
     Args:
         root: the folder with the JSON files.
@@ -97,12 +97,15 @@ class BlenderReader(GivenFrameReader):
         if not splits["train"]:
             raise InputError(f"{self.root} has no views to learn from. Export transforms_train.json again.")
         judged = "test" if splits["test"] else "val" if splits["val"] else f"every {HOLD_EVERY}th train view"
-        if not splits["val"]:
-            splits["train"], splits["val"] = every_kth(splits["train"], HOLD_EVERY)
-            log.info("%s has no val split: every %dth train view is held out for it.", self.root, HOLD_EVERY)
-        if not splits["test"]:
-            splits["test"] = splits["val"]
-            log.info("%s has no test split: the %d val views serve as test.", self.root, len(splits["val"]))
+        if not splits["val"] and not splits["test"]:
+            splits["train"], held = every_kth(splits["train"], HOLD_EVERY)
+            splits |= {"val": held, "test": held}
+            log.info("%s has no val or test split: every %dth train view is held out.", self.root, HOLD_EVERY)
+        for missing, other in (("val", "test"), ("test", "val")):
+            if not splits[missing]:
+                splits[missing] = splits[other]
+                count = len(splits[other])
+                log.info("%s has no %s split: the %d %s views serve as it.", self.root, missing, count, other)
         files = [(width, height)] * len(paths)
         cameras = cameras_of(capture, files, pixels, self.downscale)
         learnt = {paths[view] for view in splits["train"]}

@@ -88,17 +88,17 @@ def test_names_are_the_shortest_that_differ(tmp_path, root):
 @pytest.mark.parametrize(
     ("absent", "val", "test", "judged", "said"),
     [
-        (("val",), (0, 8), (9, 10, 11), "test", ["has no val split: every 8th train view is held out for it."]),
-        (("test",), (9, 10), (9, 10), "val", ["has no test split: the 2 val views serve as test."]),
-        (("val", "test"), (0, 8), (0, 8), "every 8th train view", ["has no val split", "has no test split"]),
+        (("val",), (9, 10, 11), (9, 10, 11), "test", ["has no val split: the 3 test views serve as it."]),
+        (("test",), (9, 10), (9, 10), "val", ["has no test split: the 2 val views serve as it."]),
+        (("val", "test"), (0, 8), (0, 8), "every 8th train view", ["has no val or test split: every 8th train view"]),
     ],
 )
-def test_missing_splits_are_held_out(root, caplog, absent, val, test, judged, said):
+def test_a_missing_split_is_the_other_and_without_either_views_are_held_out(root, caplog, absent, val, test, judged, said):
     for split in absent:
         write_transforms(root, split, []) if split == "test" else (root / f"transforms_{split}.json").unlink()
     with caplog.at_level(logging.INFO):
         scene = BlenderReader(str(root)).read()
-    train = tuple(range(1, 8)) if "val" in absent else tuple(range(9))
+    train = tuple(range(1, 8)) if len(absent) == 2 else tuple(range(9))
     assert scene.splits == {"train": train, "val": val, "test": test}
     assert all(message.startswith(f"{root} {start}") for message, start in zip(caplog.messages, said, strict=True))
     assert scene.protocol["test_views"] == judged
