@@ -5,7 +5,6 @@ Each choice is said in one line, with the setting that makes another.
 
 import copy
 import logging
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -102,10 +101,10 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> lis
 
     `short`: there is little time for training.
     """
-    typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
+    typed = set(map(key_of, overrides))
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
     suited = []
-    if "encoder" not in typed:
+    if not typed & {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}:
         pixels = grid_for(scene)
         resolution = max(pixels // 2, 512) if short or few else pixels
         table = 18 if short else TABLE_SIZES[resolution]

@@ -112,6 +112,7 @@ def seen_sharply(photographs=30):
     ("photographs", "overrides", "grid", "said"),
     [
         (30, (), (2048, 19), "as small as the pixels"),
+        (30, ("encoder.blend_in=0.5",), (2048, 19), "as small as the pixels"),
         (30, ("budget.seconds=60",), (1024, 18), "twice as wide as the pixels because the run is short"),
         (29, (), (1024, 18), "twice as wide as the pixels because there are few photographs and no known distances"),
     ],
