@@ -93,7 +93,7 @@ def test_names_are_the_shortest_that_differ(tmp_path, root):
         (("val", "test"), (0, 8), (0, 8), "every 8th train view", ["has no val or test split: every 8th train view"]),
     ],
 )
-def test_a_missing_split_is_the_other_and_without_either_views_are_held_out(root, caplog, absent, val, test, judged, said):
+def test_a_missing_split_is_the_other_else_views_are_held_out(root, caplog, absent, val, test, judged, said):
     for split in absent:
         write_transforms(root, split, []) if split == "test" else (root / f"transforms_{split}.json").unlink()
     with caplog.at_level(logging.INFO):
