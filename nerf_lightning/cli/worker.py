@@ -8,6 +8,7 @@ import json
 import sys
 from pathlib import Path
 
+from nerf_lightning.cli.loading import quick_imports
 from nerf_lightning.cli.main import command_module, explained
 from nerf_lightning.cli.process import quick_end
 from nerf_lightning.files.budgets import Budgets, set_limits
@@ -20,23 +21,24 @@ def main() -> None:
 
 
 def _run(command: str, folder: Path, launcher: int) -> None:
-    from hydra.conf import HydraConf
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.core.utils import configure_log, setup_globals
-    from omegaconf import OmegaConf
+    with quick_imports():
+        from hydra.conf import HydraConf
+        from hydra.core.hydra_config import HydraConfig
+        from hydra.core.utils import configure_log, setup_globals
+        from omegaconf import OmegaConf
 
-    from nerf_lightning.compute import ranks
-    from nerf_lightning.compute.devices import choose_device
-    from nerf_lightning.training.launch.processes import end_with, joined
+        from nerf_lightning.compute import ranks
+        from nerf_lightning.compute.devices import choose_device
+        from nerf_lightning.training.launch.processes import end_with, joined
 
-    end_with(launcher)
+        end_with(launcher)
+        module = command_module(command)
     setup_globals()
     config = OmegaConf.load(folder / "config.yaml")
     set_limits(Budgets(**config.budgets))
     hydra = OmegaConf.merge(OmegaConf.structured(HydraConf), OmegaConf.load(folder / "hydra.yaml"))
     HydraConfig.instance().set_config(OmegaConf.create({"hydra": hydra}))
     configure_log(hydra.job_logging)
-    module = command_module(command)
     with joined(choose_device(config.trainer.accelerator)[0]):
         result = module.run(config)
         if ranks.is_first():

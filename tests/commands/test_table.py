@@ -181,7 +181,7 @@ def test_force_names_every_difference_once(table, tmp_path):
         "background: white and black.",
         "split: test and val.",
     ]
-    assert [note.count(f"/{run}") for note, run in zip(notes, "bcd", strict=True)] == [1, 1, 1]
+    assert [note.count(f"/runs/{run}") for note, run in zip(notes, "bcd", strict=True)] == [1, 1, 1]
 
 
 def test_whatever_was_measured_differently_is_refused(table, tmp_path):

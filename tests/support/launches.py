@@ -119,7 +119,7 @@ def replayed(model: str, precision: str) -> tuple[list[str], dict[str, int]]:
 
     And what a step asks for beside its replay.
     """
-    with StandInDevice("cuda") as there, Launches() as launches:
+    with StandInDevice("cuda") as there, Launches(lambda *_, **__: None) as launches:
         run = step_by_step(model, there.device, precision, None, *small(model, resolution=8, num_levels=4))
         read: dict[str, StorageWeakRef] = {}
 

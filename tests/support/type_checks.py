@@ -5,6 +5,7 @@ compiler take a quarter of the time of many tests. Here a function is prepared w
 and its result are checked once by beartype, and axes have their sizes within one call, as ever.
 """
 
+import collections.abc
 import dataclasses
 import functools
 import inspect
@@ -138,18 +139,25 @@ def _once_for_shapes(function: types.FunctionType) -> Callable:
 def _shapes(value: Any) -> Any:
     """Return all that decides whether a value passes, where `_follows_from_shapes` of what is asked of it."""
     kind = type(value)
-    if kind is tuple:
+    if kind is tuple or kind is list:
         return (kind, *map(_shapes, value))
+    if kind is dict:
+        return (kind, *[(name, _shapes(each)) for name, each in value.items()])
+    if kind is str:  # of a Literal, the words
+        return value
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     return kind if shape is None or dtype is None else (kind, dtype, shape)
 
 
 def _follows_from_shapes(hint: Any) -> bool:
-    """Whether it asks for nothing but classes, shapes and types of elements, of a value and of a few parts."""
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType, tuple):
-        # Of as many parts as there are, beartype looks at another one each time: `...` is no class.
-        return all(map(_follows_from_shapes, typing.get_args(hint)))
+    """Whether it asks for nothing but classes, shapes, types of elements and words, of a value and of its parts."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return all(isinstance(word, str) for word in parts)
+    if origin is collections.abc.Callable:  # beartype asks for no more than that it can be called
+        return True
+    if origin in (typing.Union, types.UnionType, tuple, list, dict):
+        return all(_follows_from_shapes(part) for part in parts if part is not ...)
     if hint is Any or hint is None or _is_array(hint):
         return True
     return isinstance(hint, type) and origin is None and not getattr(hint, "_is_protocol", False)

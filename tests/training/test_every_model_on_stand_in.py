@@ -19,6 +19,7 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
+UPDATED = 4  # grids have been updated once
 TILE_POINTS = 128
 
 # At the first update the host reads which cells there are, and how large; it sends their numbers.
@@ -80,7 +81,7 @@ def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
 def test_every_model_trains_and_renders_on_mps(model):
     with StandInDevice("mps") as there:
         run = run_on(there, model, "32-true")
-        for _ in range(STEPS):
+        for _ in range(UPDATED):
             run.step()
         render_picture(run.training.model.eval(), run.training.rays, 0, "white", 1 << 14)
         assert bool(run.all_losses().isfinite().all())

@@ -272,8 +272,7 @@ def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_mo
 
 
 @pytest.mark.parametrize(
-    ("tile_points", "parts"),
-    [(None, [slice(0, 64)]), (16, [slice(0, 64)]), (200, [slice(0, 16), slice(16, 64)])],
+    ("tile_points", "parts"), [(None, [slice(0, 64)]), (16, [slice(0, 64)]), (200, [slice(0, 16), slice(16, 64)])]
 )
 def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(tile_points, parts):
     model = tiny_model(density_bias=0.5).requires_grad_(False)

@@ -151,37 +151,29 @@ def test_numbers_of_values_may_exceed_32_bits(reachable):
         assert set().union(*offsets) == {"i64"}
 
 
-CHECKS = {
-    "hash_grid": """
-from support.triton_twin import check_against_the_reference
-check_against_the_reference("cpu", 140)
-""",
-    "mlp": """
+INTERPRETED = """
+import sys
+import torch
+sys.path.insert(0, "tests")
 from nerf_lightning.nerf.kernels.mlp import cuda
+from support.triton_kernels import check_all
 from support.triton_perceptron import check_perceptron
+from support.triton_twin import check_against_the_reference
+
+check_all("cpu", torch.Generator().manual_seed(0), names=sys.argv[1:])
+check_against_the_reference("cpu", 140)
 cuda.PROGRAMS = 2  # so that one takes several blocks
 check_perceptron("cpu", [0, 1, 640])
-""",
-    "batches": """
-import torch
-from support.triton_kernels import check_all
-check_all("cpu", torch.Generator().manual_seed(0), names=("adam.cuda", "pixels.cuda", "rays.cuda"))
-""",
-    "others": """
-import torch
-from support.triton_kernels import check_all
-check_all("cpu", torch.Generator().manual_seed(0))
-""",
-}
+"""
+QUICK = ("adam.cuda", "pixels.cuda", "rays.cuda")
 
 
-@pytest.mark.parametrize(
-    "kernel", [pytest.param(name, marks=[pytest.mark.minutes] * (name == "others")) for name in CHECKS]
-)
-def test_through_the_interpreter(kernel):
+@pytest.mark.parametrize("small", [QUICK, pytest.param(tuple(SMALL), marks=pytest.mark.minutes)], ids=["quick", "all"])
+def test_through_the_interpreter(small):
     pytest.importorskip("triton", reason="triton is not installed (Linux only)")
     # The interpreter is chosen when the kernels are defined: a process of its own.
-    code = f"import sys\nsys.path.insert(0, 'tests')\n{CHECKS[kernel]}"
     environment = os.environ | {"TRITON_INTERPRET": "1"}
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", INTERPRETED, *small], env=environment, capture_output=True, text=True
+    )
     assert result.returncode == 0, result.stderr

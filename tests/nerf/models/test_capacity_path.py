@@ -7,6 +7,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.build_step import build_step
@@ -20,8 +21,8 @@ STATIC = (
 
 @pytest.fixture(autouse=True)
 def _samples_are_packed():
-    """Without the CPU's kernels that render whole rays: GPUs have none."""
-    with without("render.cpu", "render.gradients"):
+    """Without the CPU's kernels that render whole rays, and in one tile: GPUs have none, and do not share it out."""
+    with without("render.cpu", "render.gradients"), torch_on_one_thread(shares_out=False):
         yield
 
 

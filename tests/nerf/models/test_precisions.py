@@ -21,6 +21,8 @@ LESS = {"nerf": (20, 10, 12), "nerf_occupancy": (20, 16, 12), "view_transformer_
 LESS["view_transformer"] = (5, 8, 12)
 # They render each view from up to ten others.
 LOOKING = ("view_transformer", "view_transformer_tiny")
+# One of each kind; make test-slow has the others, which are larger.
+ALWAYS = ("nerf_tiny", "nerf_occupancy", "fast_small", "fast_dense", "fast_proposal", "view_transformer_tiny")
 # Two of four: from both sides.
 SEEN_FROM = (0, 2)
 
@@ -53,7 +55,7 @@ def background_of(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(each, marks=pytest.mark.exhaustive if each == "view_transformer" else ())
+        pytest.param(each, marks=() if each in ALWAYS else pytest.mark.minutes)
         for each in options("model")
         if each != "auto"  # it is one of the others
     ],

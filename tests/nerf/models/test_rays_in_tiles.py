@@ -24,15 +24,15 @@ from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import PixelStore
 from nerf_lightning.visualization.pictures import panels
 
-TILE = 1000
-WIDTH, HEIGHT, LARGE_TILE = 500, 350, 4096
-SCENE = ball_scene(size=41)
+TILE = 300
+WIDTH, HEIGHT, LARGE_TILE = 500, 250, 4096
+SCENE = ball_scene(size=19)
 FORWARD = replace(SCENE.cameras, c2w=torch.eye(4)[:3].expand(len(SCENE.near), 3, 4), ndc=torch.full((6, 2), 1.6))
 CAMERAS = {
     "pinhole": SCENE.cameras,
-    "panorama": panorama_cameras(SCENE.cameras.c2w, 60, 30),
+    "panorama": panorama_cameras(SCENE.cameras.c2w, 30, 15),
     "ndc": FORWARD,
-    **{f"{kind} {lens[0]}": ball_scene(lens=lens, lens_model=kind, size=41).cameras for kind, lens in LENSES},
+    **{f"{kind} {lens[0]}": ball_scene(lens=lens, lens_model=kind, size=19).cameras for kind, lens in LENSES},
 }
 
 
