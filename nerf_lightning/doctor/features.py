@@ -44,9 +44,9 @@ class Corners:
     """Mean color around the corner, in [0, 1]."""
 
 
-def shrunk_cameras(cameras: Cameras) -> Cameras:
-    """Return the cameras of the pictures that corners are looked for in."""
-    scale = LONGER_SIDE / torch.maximum(cameras.width, cameras.height)
+def shrunk_cameras(cameras: Cameras, longer_side: int = LONGER_SIDE) -> Cameras:
+    """Return the cameras of the pictures that corners are looked for in, which need not be smaller."""
+    scale = longer_side / torch.maximum(cameras.width, cameras.height)
     width, height = ((scale * side).round().long().clamp(min=1) for side in (cameras.width, cameras.height))
     return resized(cameras, width, height)
 

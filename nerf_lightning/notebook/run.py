@@ -13,10 +13,11 @@ from nerf_lightning.checkpoints.format import KEY, LIGHTNING
 from nerf_lightning.checkpoints.reading import checkpoint_of, content_to_resume, read_checkpoint
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.checkpoints.writing import write_checkpoint
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import key_of, quoted
+from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
@@ -194,6 +195,7 @@ def build_run(
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
     scene = build(config.scene).read() if scene is None else scene
+    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type == "cuda")
     chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
     config, choices = resolve_correction(config, choices, overrides, former=chosen_before)

@@ -10,11 +10,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding, require_sound
+from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
@@ -82,6 +83,7 @@ def assemble_job(
             each.require_access()
     scene = build(asked.scene).read() if scene is None else scene
     post_training.require_film(scene)
+    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type == "cuda", former)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)

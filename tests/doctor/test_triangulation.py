@@ -1,0 +1,46 @@
+"""Distances triangulated from matches: near to the truth, of training views alone, and none where nothing agrees."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.doctor.triangulation import FEWEST, triangulated, with_distances
+
+
+@pytest.fixture(scope="module")
+def bricks():
+    """Some views from one side."""
+    scene = build(compose_config("train", ["scene=bricks", "scene.resolution=96"])[0].scene).read()
+    apart = (scene.cameras.c2w[:, :, 3] - scene.cameras.c2w[0, :, 3]).norm(dim=-1)
+    return replace(scene, splits={"train": tuple(sorted(apart.argsort()[:10].tolist()))})
+
+
+def errors(scene, found):
+    """Relative errors of the distances."""
+    pixels = found.pixels
+    return (found.distance / scene.truth.depth[scene.pixels.index_of(pixels.view, pixels.x, pixels.y)] - 1.0).abs()
+
+
+def test_distances_are_those_of_the_surfaces_that_training_views_show(bricks):
+    found = triangulated(bricks)
+    assert len(found) >= FEWEST * len(bricks.splits["train"])
+    assert torch.isin(found.pixels.view, torch.tensor(bricks.splits["train"])).all()
+    off = errors(bricks, found)
+    assert float(off.median()) < 0.02
+    assert float((off < 0.1).float().mean()) > 0.8
+    assert float(off[found.certainty > 0.8].median()) <= float(off.median())
+
+
+def test_cameras_that_contradict_the_photographs_tell_nothing(bricks):
+    turned = bricks.cameras.c2w[torch.randperm(len(bricks.cameras.c2w), generator=torch.Generator().manual_seed(0))]
+    assert triangulated(replace(bricks, cameras=replace(bricks.cameras, c2w=turned))) is None
+
+
+def test_what_a_capture_knows_itself_stays(bricks):
+    known = with_distances(bricks)
+    assert known.depths is not None
+    assert with_distances(known) is known
+    assert with_distances(replace(bricks, capture_of=(0,) * len(bricks.view_names))).depths is None
