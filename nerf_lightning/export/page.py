@@ -24,7 +24,8 @@ class PageExport(SplatFitting):
     """Write `page.html`: the scene as splats, with what draws them, the cameras and small photographs.
 
     Args:
-        num_splats: maximum number of splats; auto: 200 per pixel of a view's side, at most 150,000.
+        num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
+            pixels, at most 150,000.
         seconds: seconds of fitting the splats to the training photographs; without them, or if the model has a
             correction per photograph, to renders of the field; 0: no fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
@@ -75,8 +76,12 @@ class PageExport(SplatFitting):
 
     def _marks(self, record: SceneRecord, folder: Path) -> Marks:
         kept = folder / MARKS
-        path = kept if self.views is None and kept.is_file() else self.views and Path(self.views).expanduser()
-        marks = read_marks(path or None, record)
+        path = kept if self.views is None else Path(self.views).expanduser()
+        if self.views is not None and not path.is_file():
+            raise InputError(
+                f'what.views={self.views}: there is no such file. The page\'s button "save as json" saves one.'
+            )
+        marks = read_marks(path if path.is_file() else None, record)
         names = [view["name"] for view in marks["views"]]
         if self.first_view is not None and self.first_view not in (*names, *record.view_names):
             views = f"views: {listed(names)}; " if names else ""

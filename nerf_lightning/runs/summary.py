@@ -1,5 +1,6 @@
 """What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
 CLASS = "._target_"
+SMALL = re.compile(r"[-+]?\d*\.?\d+e-\d+")  # 2e-2 is 0.02.
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,13 @@ def folders_of_runs(root: Path) -> list[Path]:
 
 
 def by_key(overrides: list[str]) -> dict[str, str]:
-    """Return overrides as a mapping; what is given twice holds as given last.
+    """Return overrides as a mapping, numbers in one way of writing; what is given twice holds as given last.
 
-    >>> by_key(["model=nerf_tiny", "seed=0", "seed=1"])
-    {'model': 'nerf_tiny', 'seed': '1'}
+    >>> by_key(["model=nerf_tiny", "optimizer.lr=2e-2", "seed=0", "seed=1"])
+    {'model': 'nerf_tiny', 'optimizer.lr': '0.02', 'seed': '1'}
     """
-    return {key: value for key, _, value in (override.partition("=") for override in overrides)}
+    pairs = (override.partition("=") for override in overrides)
+    return {key: repr(float(value)) if SMALL.fullmatch(value) else value for key, _, value in pairs}
 
 
 def told_settings(overrides: dict[str, str]) -> dict[str, str]:

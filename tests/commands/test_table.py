@@ -33,7 +33,7 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
             overrides=(f"optimizer.lr={rate}", "trainer.max_steps=10", f"paths.output_dir={number}"),
         )
     _, rows = table("published=false")
-    assert [row["optimizer.lr"] for row in rows] == ["1e-3", "1e-2"]
+    assert [row["optimizer.lr"] for row in rows] == ["0.001", "0.01"]
     assert "trainer.max_steps" not in rows[0]
     assert "paths.output_dir" not in rows[0]
 
@@ -44,7 +44,7 @@ def test_what_a_run_did_not_say_is_told_from_its_config(table, tmp_path):
         (run / ".hydra" / "config.yaml").write_text("optimizer: {lr: 0.03}\nrefinement: {_target_: x}\n")
         (run / ".hydra" / "hydra.yaml").write_text("runtime: {choices: {refinement: none, model: fast, scene: a}}\n")
     _, rows = table("published=false")
-    assert [(row["optimizer.lr"], row["refinement"]) for row in rows] == [("1e-3", "se3"), ("0.03", "none")]
+    assert [(row["optimizer.lr"], row["refinement"]) for row in rows] == [("0.001", "se3"), ("0.03", "none")]
 
 
 def test_settings_without_a_column_are_counted_below(table, tmp_path):

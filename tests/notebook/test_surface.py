@@ -96,7 +96,7 @@ def test_a_model_is_exported_as_by_the_command(run, tmp_path):
         (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
         (lambda model: model.path(num_frames=0), ("num_frames",)),
         (lambda model: model.export("pages"), ("pages", "page")),
-        (lambda model: model.export("page", resolution=3), ("what.resolution=3",)),
+        (lambda model: model.export("page", sh_degree=4), ("what.sh_degree=4",)),
         (lambda model: nl.load("nowhere"), ("no checkpoint",)),
     ],
 )

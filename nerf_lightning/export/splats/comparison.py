@@ -69,6 +69,6 @@ def compared(
         of_splats.append(image_metrics(splats, truth, kept))
         named = [("photograph", truth)] if isinstance(scene, Scene) else []
         panels = panels or [*named, ("field", field), ("splats", splats)]
-        report("measured", (number + 1) / len(views))
+        report("comparing", (number + 1) / len(views))
     said = f"{len(views)} {split} view{'s' if len(views) > 1 else ''}"
     return Comparison(said, mean_over_images(of_splats), mean_over_images(of_field) if of_field else None, panels)

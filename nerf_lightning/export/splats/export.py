@@ -27,7 +27,8 @@ class SplatsExport(SplatFitting):
     """Write `splats.ply`, `.spz` or `.glb`, `splats.json` with what was measured, and `splats.png` to look at.
 
     Args:
-        num_splats: maximum number of splats; auto: 200 per pixel of a view's side, at most 150,000.
+        num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
+            pixels, at most 150,000.
         seconds: seconds of fitting to the training photographs; without them, or if the model has a correction per
             photograph, to renders of the field; 0: no fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.

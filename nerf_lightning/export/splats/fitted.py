@@ -20,7 +20,7 @@ ROOM = "nerf_lightning.export.splats"
 KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
 PER_SIDE, MOST = 200, 150_000
 MOST_SHOWN = 3_000_000  # 500 MB as PLY.
-STAGES = {"surfaces": 15.0, "measured": 5.0}
+STAGES = {"surfaces": 15.0, "comparing": 5.0}
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 
 # Beyond this angle from the horizon (80 degrees) a small sphere may appear as wide as the whole picture.
@@ -80,6 +81,7 @@ def panorama_cameras(c2w: Float[Tensor, "views 3 4"], width: int, height: int) -
     )
 
 
+@disable_autocast
 def faces_of_panoramas(panoramas: Cameras) -> Cameras:
     """Return six pinhole cameras for each panorama, the faces of a cube: front, left, back, right, top and bottom."""
     around = [[[c, 0, s], [0, 1, 0], [-s, 0, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]

@@ -16,7 +16,8 @@ class TimeBudget(Callback):
     """Stop after so many seconds of training, and stretch the schedule to just that length.
 
     The time that a run has used is part of its state, so a resumed run has the rest. While the process is stopped
-    (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used. Such a run is not repeatable to the bit: how many
+    (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by the first step of a process, which may
+    compile kernels for half a minute. Such a run is not repeatable to the bit: how many
     steps fit depends on the machine.
 
     Args:
@@ -31,7 +32,7 @@ class TimeBudget(Callback):
         if seconds <= 0:
             raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
         self.seconds, self.every_steps = seconds, every_steps
-        self.used, self.since = 0.0, 0.0
+        self.used, self.since, self.compiles = 0.0, 0.0, True
         self.former: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
@@ -45,6 +46,8 @@ class TimeBudget(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
+        if self.compiles:
+            self.compiles, self.since = False, now
         # All processes stop at the same step: the slowest clock is everybody's.
         self.used, self.since = ranks.largest(self.used + now - self.since), now
         if pl_module.step.progress.step % self.every_steps == 0:
