@@ -180,7 +180,8 @@ def _no_setting(name: str, value: str | None, asked: Command) -> str:
     training = command_named("train")
     if training is not None and name in known_names(training):
         return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."
-    close = near(name, known_names(asked))
+    names = known_names(asked)
+    close = sorted(each for each in names if each.rpartition(".")[2] == name)[:3] or near(name, names)
     if close:
         given = f"={value}" if value and PLAIN.fullmatch(value) else ""
         return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"

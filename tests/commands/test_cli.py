@@ -82,6 +82,7 @@ def test_mistyped_options_and_commands_have_near_matches(nerf):
     [
         ("trainer.max_stps=3", "trainer.max_steps"),
         ("optimiser.lr=1", "optimizer.lr"),
+        ("lr=0.1", "optimizer.lr=0.1"),
         ("model=nerf_smal", "nerf_small"),
         ("modle=fast", "model=fast"),
         ("encoder@direction_encodr=frequency", "encoder@direction_encoder=frequency"),
