@@ -14,6 +14,7 @@ from nerf_lightning.compute.machine import torch_threads
 from nerf_lightning.data.captures.known_depths import depths_of_points
 from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.doctor.epipolar import agreeing, line_distances, places
+from nerf_lightning.doctor.examine import NOTICEABLE
 from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
 from nerf_lightning.doctor.matches import matched_pairs, nearest_views
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -26,7 +27,6 @@ MOST_VIEWS = 200  # evenly spread where there are more.
 LEAST_ERROR = 0.7  # Pixels of the shrunk pictures: no corner is found more exactly.
 LEAST_AGREEING = 0.15  # Share of the matches that agree with the cameras: 0.29 to 0.71, of wrong cameras at most 0.04.
 FEWEST = 10  # Distances per view.
-NOTICEABLE = 30  # Views.
 
 log = logging.getLogger(__name__)
 
@@ -56,18 +56,14 @@ def triangulated(scene: Scene) -> KnownDepths | None:
     matches = matched_pairs(cameras, corners, sorted(pairs), shown)
     agrees = agreeing(matches, scene.cameras.c2w)
     matches, count = matches.where(agrees), int(agrees.sum())
-    if count < LEAST_AGREEING * len(agrees):
+    if count <= LEAST_AGREEING * len(agrees):
         return None
     larger = (scene.cameras.focal / cameras.focal).mean(dim=-1).double()[matches.view[:, 0]]
     errors = larger * line_distances(matches, scene.cameras.c2w).amax(dim=-1).clamp(min=LEAST_ERROR)
     tracks = torch.stack([torch.arange(count).repeat(2), matches.view.T.flatten()], dim=1)
-    points = places(matches, scene.cameras.c2w).double()
-    found = depths_of_points(points, errors, tracks, scene.cameras.map(_double)) if count else None
-    if found is None or len(found) < FEWEST * len(views):
+    exact = replace(scene.cameras, c2w=scene.cameras.c2w.double())
+    found = depths_of_points(places(matches, scene.cameras.c2w).double(), errors, tracks, exact)
+    if len(found) < FEWEST * len(views):
         return None
     log.info("distances: %s pixels, triangulated from matches between photographs", f"{len(found):,}")
     return found
-
-
-def _double(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.double() if tensor.is_floating_point() else tensor

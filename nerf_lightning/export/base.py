@@ -1,7 +1,7 @@
 """The contract of an export: a model in, files out, in the user's own frame."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +11,9 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
+
+Report = Callable[[str, float], None]
+"""Takes the name of a stage, and how much of it is done, from 0 to 1."""
 
 
 @dataclass(frozen=True)

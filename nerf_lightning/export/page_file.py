@@ -20,7 +20,7 @@ from torch.nn import functional
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.export.page_marks import Marks
 from nerf_lightning.export.splats.fitted import as_faces
-from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
+from nerf_lightning.export.splats.gaussians import DILATION, Gaussians, Pinhole
 from nerf_lightning.export.splats.quantized import QuantizedSplats
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.views import color_behind, without_lens
@@ -87,6 +87,7 @@ def write_page(
     about = splats.described() | {
         "bytes": len(packed),
         "focal": focal,
+        "dilation": DILATION,
         "near": _nearest(record),
         "unbounded": record.space == "contracted",
         "cameras": [_camera(record.cameras, view) for view in views],

@@ -12,7 +12,7 @@ from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
 CLASS = "._target_"
-SMALL = re.compile(r"[-+]?\d*\.?\d+e-\d+")  # 2e-2 is 0.02.
+DECIMAL = re.compile(r"[-+]?(\d+\.\d*|\.\d+|\d+(?=[eE]))([eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def by_key(overrides: list[str]) -> dict[str, str]:
     {'model': 'nerf_tiny', 'optimizer.lr': '0.02', 'seed': '1'}
     """
     pairs = (override.partition("=") for override in overrides)
-    return {key: repr(float(value)) if SMALL.fullmatch(value) else value for key, _, value in pairs}
+    return {key: repr(float(value)) if DECIMAL.fullmatch(value) else value for key, _, value in pairs}
 
 
 def told_settings(overrides: dict[str, str]) -> dict[str, str]:

@@ -5,6 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+import nerf_lightning as nl
+from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.doctor.triangulation import FEWEST, triangulated, with_distances
@@ -15,7 +17,8 @@ def bricks():
     """Some views from one side."""
     scene = build(compose_config("train", ["scene=bricks", "scene.resolution=96"])[0].scene).read()
     apart = (scene.cameras.c2w[:, :, 3] - scene.cameras.c2w[0, :, 3]).norm(dim=-1)
-    return replace(scene, splits={"train": tuple(sorted(apart.argsort()[:10].tolist()))})
+    near, held = apart.argsort()[:10].tolist(), tuple(apart.argsort()[10:12].tolist())
+    return replace(scene, splits={"train": tuple(sorted(near)), "val": held, "test": held})
 
 
 def errors(scene, found):
@@ -44,3 +47,22 @@ def test_what_a_capture_knows_itself_stays(bricks):
     assert known.depths is not None
     assert with_distances(known) is known
     assert with_distances(replace(bricks, capture_of=(0,) * len(bricks.view_names))).depths is None
+
+
+@pytest.mark.parametrize(
+    ("space", "overrides", "learns"),
+    [
+        ("contracted", ("model=auto",), True),
+        ("contracted", ("model=auto", "loss=proposal"), False),
+        ("contracted", ("model=fast_proposal",), False),
+        ("contracted", ("model=fast_proposal", "loss=depth"), True),
+        ("bounded", ("model=auto",), False),
+    ],
+)
+def test_a_run_has_distances_where_its_loss_takes_them(bricks, space, overrides, learns):
+    record = replace(bricks, space=space)
+    run = nl.build_run(*overrides, "encoder.max_resolution=64", "encoder.log2_table_size=10", scene=record)
+    assert (run.scene.depths is not None) == learns
+    asked = compose_config("train", ("scene=in_memory", "scene.name=bricks", *overrides))
+    job = assemble_job(*asked, overrides, scene=record)
+    assert (job.scene.depths is not None) == learns

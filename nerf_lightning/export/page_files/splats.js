@@ -1,7 +1,6 @@
 // ---- The scene as 3D Gaussian splats (Kerbl et al. 2023), drawn from the farthest to the nearest ----------------
 
 const BUCKETS = 1 << 16;  // Of distances, by their logarithms.
-const DILATION = 0.1;     // Pixels^2 of the photographs, as in gaussians.py.
 
 // The planes of bytes of quantized.py: places, and for each splat texels of quaternion, sizes and opacity, color, harmonics.
 function splatsOf(about, content) {
@@ -134,7 +133,7 @@ class Picture {
   }
 
   // In a finer picture than the photographs' splats are wider by as much: they touch as they did in the fitting.
-  dilation(focal) { return DILATION * Math.max(1, focal[0] / this.about.focal) ** 2; }
+  dilation(focal) { return this.about.dilation * Math.max(1, focal[0] / this.about.focal) ** 2; }
 
   // How far away the surface is along the ray through a place of the window (in pixels of CSS): where half of the light
   // is stopped; 0: nowhere.

@@ -50,7 +50,7 @@ vec3 harmonic_color(vec3 look) {
   basis[13] = 1.445305721320277 * z * (x * x - y * y);
   basis[14] = 0.5900435899266435 * x * (3.0 * y * y - x * x);
 #endif
-  float unit = 255.0 / 124.0 * harmonics;
+  float unit = 255.0 / 124.0 * harmonics;  // LARGEST of quantized.py
   for (int first = 0, at = 3; first < (DEGREE + 1) * (DEGREE + 1) - 1; first += 4, at += 3) {
     vec4 a = unit * (texel(at) - 128.0 / 255.0), b = unit * (texel(at + 1) - 128.0 / 255.0);
     vec4 c = unit * (texel(at + 2) - 128.0 / 255.0);

@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Report
 from nerf_lightning.export.splats.fitted import FittedSplats
 from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.export.splats.rasterizer import rasterize

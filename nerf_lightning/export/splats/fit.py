@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Report
 from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.views import View, color_behind
@@ -92,8 +92,9 @@ class _State:
         self.rates = RATES | {"means": MEANS_RATE * extent}
         self.first, self.second = (gaussians.map(torch.zeros_like) for _ in range(2))
         self.step, self.error = 0, torch.zeros(len(gaussians))
-        self.eyes, self.pixels = torch.stack([camera.eye for camera in cameras]), [1 / c.focal[0] for c in cameras]
-        self.finest = self._finest(gaussians)
+        self.eyes = torch.stack([camera.eye for camera in cameras])
+        self.pixels = torch.tensor([1 / camera.focal[0] for camera in cameras])
+        self.finest = self._finest()
 
     def learn(self, view: View, background: Float[Tensor, "3"], rate: float) -> float:
         """Take one step of Adam, and return the loss."""
@@ -117,9 +118,9 @@ class _State:
         self.gaussians.log_scales.detach().clamp_(min=self.finest[:, None])
         return float(loss.detach())
 
-    def _finest(self, gaussians: Gaussians) -> Float[Tensor, "n"]:
+    def _finest(self) -> Float[Tensor, "n"]:
         """Return the least logarithm of each splat's standard deviations: `LEAST_VARIANCE` to the nearest camera."""
-        pixels = torch.cdist(gaussians.means.detach(), self.eyes) * torch.tensor(self.pixels)
+        pixels = torch.cdist(self.gaussians.means.detach(), self.eyes) * self.pixels
         return pixels.amin(dim=-1).clamp(min=1e-12).log() + 0.5 * math.log(LEAST_VARIANCE)
 
     def refine(self, budget: int, generator: torch.Generator) -> None:
@@ -144,4 +145,4 @@ class _State:
             return torch.cat([moment[kept], moment.new_zeros(2 * len(split), *moment.shape[1:])])
 
         self.first, self.second = self.first.map(with_new), self.second.map(with_new)
-        self.error, self.finest = torch.zeros(len(self.gaussians)), self._finest(self.gaussians)
+        self.error, self.finest = torch.zeros(len(self.gaussians)), self._finest()

@@ -6,8 +6,7 @@ from typing import Literal
 
 import torch
 
-from nerf_lightning.export.base import Export, require_kernels, require_setting
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Export, Report, require_kernels, require_setting
 from nerf_lightning.export.splats.fit import Fitting, fit
 from nerf_lightning.export.splats.gaussians import Gaussians
 from nerf_lightning.export.splats.initialize import initial_gaussians, look_around
@@ -73,7 +72,7 @@ class SplatFitting(Export):
 
         Without photographs, or if the model has a correction for each, they are fitted to renders of the field.
         """
-        for module in KERNELS:
+        for module in self.kernels:
             require_kernels(module, "Fitting splats")
         photographs = None if self.beside.corrected else self.beside.photographs
         if record.cameras.lens_model == "equirectangular":

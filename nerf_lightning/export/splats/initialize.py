@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Report
 from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole, dc_of_color
 from nerf_lightning.export.splats.views import View, without_lens
 from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see

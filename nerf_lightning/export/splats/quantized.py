@@ -23,6 +23,7 @@ MOST_NATS = 12.0  # Between the largest and the smallest standard deviation: sma
 COLORS = (-0.5, 1.5)
 RARE = 0.001  # So large a share of the harmonics is clipped.
 COARSE = 4  # Steps of a byte that one step of a harmonic takes: gzip makes half of them.
+LARGEST = 127 // COARSE * COARSE
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class QuantizedSplats:
     colors: tuple[float, float]
     """those of colors,"""
     harmonics: float
-    """and byte 255 of the other harmonics, of which 128 is 0."""
+    """and 128 + `LARGEST` of the other harmonics, of which 128 is 0."""
     content: UInt8[ndarray, "planes splats"]
 
     @classmethod
@@ -47,15 +48,15 @@ class QuantizedSplats:
         rest = gaussians.sh_rest.flatten(1).numpy()
         harmonics = float(np.quantile(np.abs(rest), 1 - RARE)) if rest.size else 0.0
         words = np.ascontiguousarray(gaussians.means.numpy(), "<f4").view("<u4") + 0x80
-        signed = [127 * normalize(gaussians.quaternions, dim=-1).numpy()]
-        signed.append(np.clip(rest / max(harmonics, 1e-12), -1, 1) * (127 // COARSE) * COARSE)
+        quaternions = 127 * normalize(gaussians.quaternions, dim=-1).numpy()
+        steps = LARGEST / COARSE * np.clip(rest / max(harmonics, 1e-12), -1, 1)
         planes = [
             *((words >> shift).astype(np.uint8) for shift in (8, 16, 24)),
             _bytes(gaussians.log_scales.numpy(), *scales),
             _bytes(gaussians.opacity_logits.sigmoid()[:, None].numpy(), 0.0, 1.0),
             _bytes((0.5 + DEGREE_1 * gaussians.sh_dc).numpy(), *COLORS),
-            (128 + signed[0].round()).astype(np.uint8),
-            (128 + COARSE * (signed[1] / COARSE).round()).astype(np.uint8),
+            (128 + quaternions.round()).astype(np.uint8),
+            (128 + COARSE * steps.round()).astype(np.uint8),
         ]
         content = np.ascontiguousarray(np.concatenate(planes, axis=1).T)
         return cls(len(gaussians), gaussians.sh_degree, scales, COLORS, harmonics, content)
@@ -74,7 +75,7 @@ class QuantizedSplats:
             self.content.T, np.cumsum([3, 3, 3, 3, 1, 3, 4]), axis=1
         )
         words = sum(part.astype("<u4") << shift for part, shift in ((low, 8), (middle, 16), (high, 24)))
-        harmonics = (rest.astype(np.float32) - 128) * self.harmonics / (127 // COARSE * COARSE)
+        harmonics = (rest.astype(np.float32) - 128) * self.harmonics / LARGEST
         return Gaussians(
             torch.from_numpy(np.ascontiguousarray(words).view("<f4")),
             _values(scales, *self.scales),

@@ -12,8 +12,9 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from nerf_lightning.export.density_grid import Lattice, Report, sample_density
+from nerf_lightning.export.base import Report
 from nerf_lightning.export.visibility import num_agreeing, see
+from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, sample_density
 from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.extensions.geometry_exports.surface import surface_level
 from nerf_lightning.messages.errors import InputError

@@ -9,8 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.export.base import require_kernels
-from nerf_lightning.export.density_grid import Lattice, Report
+from nerf_lightning.export.base import Report, require_kernels
+from nerf_lightning.extensions.geometry_exports.density_grid import Lattice
 from nerf_lightning.extensions.geometry_exports.density_mesh import marching_cubes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal

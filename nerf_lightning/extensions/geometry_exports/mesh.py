@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
-from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
+from nerf_lightning.export.base import Export, Report, refuse_ndc, require_free, require_setting
 from nerf_lightning.extensions.geometry_exports import density_mesh, fused_mesh
+from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution
 from nerf_lightning.extensions.geometry_exports.density_mesh import mesh_of_density, seen_faces, without_floaters
 from nerf_lightning.extensions.geometry_exports.fused_mesh import mesh_of_depth
 from nerf_lightning.extensions.geometry_exports.mesh_files import (

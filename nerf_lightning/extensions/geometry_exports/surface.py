@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Report
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles, weighted_renderings

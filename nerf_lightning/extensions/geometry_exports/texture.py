@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.export.base import require_kernels
-from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.base import Report, require_kernels
 from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.extensions.geometry_exports.surface import short_rays
 from nerf_lightning.messages.errors import InputError

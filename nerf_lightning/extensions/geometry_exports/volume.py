@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export.base import Export, refuse_ndc, require_free
-from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
+from nerf_lightning.export.base import Export, Report, refuse_ndc, require_free
+from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution, sample_density
 from nerf_lightning.extensions.geometry_exports.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json

@@ -17,8 +17,8 @@ class TimeBudget(Callback):
 
     The time that a run has used is part of its state, so a resumed run has the rest. While the process is stopped
     (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by the first step of a process, which may
-    compile kernels for half a minute. Such a run is not repeatable to the bit: how many
-    steps fit depends on the machine.
+    compile kernels for half a minute. Such a run is not repeatable to the bit: how many steps fit depends on the
+    machine.
 
     Args:
         seconds: training time in all, validation included.
@@ -36,8 +36,7 @@ class TimeBudget(Callback):
         self.former: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        """Start the clock; a resumed run knows how fast it was."""
-        self.since = time.perf_counter()
+        """Notice when the process is woken; a resumed run knows how fast it was."""
         if hasattr(signal, "SIGCONT"):
             self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
@@ -46,11 +45,11 @@ class TimeBudget(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
-        if self.compiles:
-            self.compiles, self.since = False, now
-        # All processes stop at the same step: the slowest clock is everybody's.
-        self.used, self.since = ranks.largest(self.used + now - self.since), now
-        if pl_module.step.progress.step % self.every_steps == 0:
+        if not self.compiles:
+            # All processes stop at the same step: the slowest clock is everybody's.
+            self.used = ranks.largest(self.used + now - self.since)
+        self.compiles, self.since = False, now
+        if self.used and pl_module.step.progress.step % self.every_steps == 0:
             self._fit_schedule(trainer, pl_module.step)
         if self.used >= self.seconds:
             trainer.should_stop = True

@@ -96,3 +96,13 @@ def test_a_training_of_days_says_once_what_takes_minutes(caplog):
         progress._warn_of_days(left)
     assert caplog.text.count("the training takes another 38 days") == 1
     assert "budget.seconds=300 ends it in five" in caplog.text
+
+
+def test_a_schedule_is_fitted_only_once_time_was_measured(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    budget, system = TimeBudget(seconds=10.0, every_steps=1), a_system(step=1)
+    for used in (0.0, 2.0):
+        now[0] += 2.0
+        budget.on_train_batch_end(trainer(), system, None, None, 0)
+        assert budget.used == used

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.export.density_grid import Lattice
+from nerf_lightning.extensions.geometry_exports.density_grid import Lattice
 from nerf_lightning.extensions.geometry_exports.density_mesh import marching_cubes
 from nerf_lightning.extensions.geometry_exports.tsdf_fusion import add_view
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels

@@ -1,7 +1,7 @@
 """A regular grid of points over a scene's box, and what a model says there."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +11,11 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
+from nerf_lightning.export.base import Report
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
-
-Report = Callable[[str, float], None]
-"""Takes the name of a stage, and how much of it is done, from 0 to 1."""
 
 CHUNK = 1 << 18  # Points of which coordinates are held at a time; a report follows each.
 
