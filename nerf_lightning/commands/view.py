@@ -10,7 +10,9 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.auth import names_of
+from nerf_lightning.viewer.export_panel import exported_files
 from nerf_lightning.viewer.page import Page, require_viser
+from nerf_lightning.viewer.ports import tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -33,9 +35,10 @@ def run(config: DictConfig) -> None:
     queue = RenderQueue(renderer)
     where = config.host, config.port, config.max_height, config.viewer.hosts
     photographs = Photographs(record, scene, background)
-    page = Page(queue, photographs, folder, *where)
+    exports = exported_files(beside_checkpoint(opened.checkpoint.path, "export"))
+    page = Page(queue, photographs, folder, *where, exports=exports)
     stopped = received_stop_signals()
-    say(f"The page is at {page.address} (Ctrl-C stops it)")
+    say(f"The page is at {page.address} (Ctrl-C stops it){tunnel(page.address)}")
     if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with
         Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:

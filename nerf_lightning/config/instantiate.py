@@ -2,9 +2,10 @@
 
 import inspect
 import types
+from pydoc import locate
 from typing import Any, Literal, Union, get_args, get_origin
 
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.files.folders import conf_file
@@ -22,7 +23,7 @@ def require_fitting_values(node: Any, path: str = "") -> None:
         for index, child in enumerate(node):
             require_fitting_values(child, f"{path}[{index}]")
     elif isinstance(node, dict):
-        parameters = _parameters(node.get("_target_"))
+        parameters = _parameters(node.get("_target_"), path)
         for key, value in node.items():
             here = f"{path}.{key}" if path else str(key)
             if key in parameters:
@@ -48,11 +49,14 @@ def require_sections(config: DictConfig, command: str) -> None:
             )
 
 
-def _parameters(target: object) -> dict[str, inspect.Parameter]:
+def _parameters(target: object, path: str) -> dict[str, inspect.Parameter]:
     # Only our own: other people's annotations promise less.
     if not isinstance(target, str) or not target.startswith(OURS):
         return {}
-    return dict(inspect.signature(get_object(target)).parameters)
+    found = locate(target)
+    if not callable(found):
+        raise InputError(f"{path}._target_={target}: nerf_lightning has no such class or function.")
+    return dict(inspect.signature(found).parameters)
 
 
 def require_fitting(value: Any, annotation: Any, path: str) -> None:

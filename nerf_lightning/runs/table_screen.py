@@ -57,6 +57,8 @@ def _table(columns: dict[str, list[str]], rows: list[Row], widest: int | None) -
         longest = max(map(cell_len, [*header.plain.split("\n"), *cells]))
         if name in DECIMALS:
             table.add_column(header, justify="right", no_wrap=True, min_width=longest)
+        elif name == "folder":  # A broken path cannot be pasted.
+            table.add_column(header, no_wrap=True, min_width=longest)
         else:
             table.add_column(header, overflow="fold", min_width=min(longest, WIDE_TEXT), max_width=widest)
     for number, row in enumerate(rows):

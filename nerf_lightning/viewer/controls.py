@@ -1,6 +1,7 @@
-"""The panel of the page: what is shown, the crop box, photographs, the camera path, snapshots."""
+"""The panel of the page: what is shown, photographs, the camera path, the crop box, snapshots, exports."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from nerf_lightning.nerf.geometry.frames import points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
+from nerf_lightning.viewer.export_panel import ExportPanel
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.path_panel import PathPanel
 from nerf_lightning.viewer.photograph_panel import PhotographPanel
@@ -24,9 +26,19 @@ NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf rende
 
 
 class Controls:
-    """The panel of one person, who first sees a vertical field of `fov` (radians); what they save lies in `folder`."""
+    """The panel of one person, who first sees a vertical field of `fov` (radians).
 
-    def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
+    What they save lies in `folder`; `exports` can be downloaded.
+    """
+
+    def __init__(
+        self,
+        session: ViewerClient,
+        folder: Path,
+        fov: float,
+        training: TrainingSwitch | None = None,
+        exports: Sequence[Path] = (),
+    ):
         self.session, self.folder = session, folder
         self.gui = session.client.gui
         self.harmless = session.queue.errors.harmless
@@ -40,6 +52,8 @@ class Controls:
         self.photographs = PhotographPanel(session, self.frusta)
         PathPanel(session, self.path, self.frusta)
         self._add_crop()
+        if exports:
+            ExportPanel(session, exports)
 
     def _add_view(self, degrees: float) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)

@@ -42,6 +42,7 @@ class Page:
         most_height: height of the finest image, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
         training: what the page may ask of the training that it shows; None: it shows none.
+        exports: files that people can download.
     """
 
     def __init__(
@@ -54,12 +55,13 @@ class Page:
         most_height: int,
         hosts: Sequence[str] | None = None,
         training: TrainingSwitch | None = None,
+        exports: Sequence[Path] = (),
     ) -> None:
         require_viser()
         from nerf_lightning.viewer.guarded_server import guarded_server
 
         self.queue, self.photographs, self.folder = queue, photographs, folder
-        self.most_height, self.training = most_height, training
+        self.most_height, self.training, self.exports = most_height, training, exports
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages are closed while a picture is on its way to them; that needs no warning.
@@ -105,7 +107,7 @@ class Page:
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
         # The browser may have said once more what its field was, before it heard of this one.
-        Controls(session, self.folder, fov, self.training)
+        Controls(session, self.folder, fov, self.training, self.exports)
         # Who has left meanwhile may have been seen off before being here.
         if client.client_id not in self.server.get_clients():
             self.queue.remove(client.client_id)

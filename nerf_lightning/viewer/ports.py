@@ -1,6 +1,8 @@
 """Where the page is: a port to listen on, the one that is wished or the next one that is free, and its address."""
 
 import logging
+import os
+import re
 import socket
 
 from nerf_lightning.messages.errors import InputError
@@ -49,6 +51,19 @@ def address_of(host: str, port: int) -> str:
     """
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def tunnel(address: str) -> str:
+    """Return what to add where the address is only this machine's and the reader may sit elsewhere; else nothing.
+
+    >>> os.environ["SSH_CONNECTION"] = "10.0.0.1 50000 10.0.0.2 22"
+    >>> tunnel("http://127.0.0.1:8080/?token=abc")
+    '\\nOver SSH: first run ssh -L 8080:127.0.0.1:8080 MACHINE on your own computer'
+    """
+    found = re.match(r"http://127\.0\.0\.1:(\d+)", address)
+    if found is None or "SSH_CONNECTION" not in os.environ:
+        return ""
+    return f"\nOver SSH: first run ssh -L {found[1]}:127.0.0.1:{found[1]} MACHINE on your own computer"
 
 
 def _try(host: str, port: int) -> None:

@@ -160,9 +160,11 @@ def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command):
     said(nerf(*command.split(), "ckpt=[1]", f"paths.output_dir={tmp_path}/out"), "is not valid: it must be a path")
 
 
-def test_a_part_of_ones_own_that_is_not_found_says_where_python_looks(nerf, capture):
-    result = nerf("train", "scene=npz", f"scene.path={capture}", "model=nerf_tiny", "loss._target_=my_losses.L1")
+def test_a_part_that_is_not_found_says_where_python_looks_and_a_misnamed_one_of_ours_that_there_is_none(nerf, capture):
+    given = ("train", "scene=npz", f"scene.path={capture}", "model=nerf_tiny")
+    result = nerf(*given, "loss._target_=my_losses.L1")
     said(result, "loss cannot be built: No module named 'my_losses'", "PYTHONPATH=FOLDER before nerf train")
+    said(nerf(*given, "loss._target_=nerf_lightning.nerf.losses.mse.L1"), "has no such class or function")
 
 
 def train_on(nerf, tmp_path, *settings):

@@ -66,7 +66,7 @@ class Gui:
 class Panel:
     """A person's panel over a ball, and the queue that serves them."""
 
-    def __init__(self, folder, scene=None, **changed):
+    def __init__(self, folder, scene=None, exports=(), **changed):
         capture, scene = scene, scene or ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
         self.queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
@@ -79,7 +79,7 @@ class Panel:
         around = frame_of(record.cameras, record.aabb)
         self.session = ViewerClient(self.client, self.queue, Photographs(record, capture, "white"), around, HEIGHT)
         self.session.start()
-        self.controls = Controls(self.session, folder, 0.6)
+        self.controls = Controls(self.session, folder, 0.6, exports=exports)
 
     def work(self):
         while self.queue.work():

@@ -9,6 +9,7 @@ from support.viewer_panel import Panel
 
 from nerf_lightning.viewer import controls
 from nerf_lightning.viewer.error_log import as_plain_markdown, one_line
+from nerf_lightning.viewer.export_panel import exported_files
 
 
 def snapshot(panel):
@@ -87,3 +88,17 @@ def test_nothing_ends_the_code_span_early(text):
 def test_surrogates_and_line_ends_are_shown_as_something_and_long_texts_are_cut():
     assert as_plain_markdown("a\udc80\n\nb\u202e") == "`a\ufffd  b\ufffd`"
     assert one_line("a" * 10**6, 3) == "aaa…"
+
+
+def test_exported_files_are_downloaded_and_one_that_has_gone_is_said(tmp_path):
+    assert exported_files(tmp_path / "none") == []
+    for name in ("splats.ply", ".part"):
+        (tmp_path / name).write_bytes(b"ply")
+    (tmp_path / "link.ply").symlink_to(tmp_path / "splats.ply")
+    panel = Panel(tmp_path, exports=exported_files(tmp_path))
+    (button,) = (label for label in panel.gui.made if label.startswith("splats.ply ("))
+    panel.press(button)
+    panel.client.send_file_download.assert_called_once_with("splats.ply", b"ply")
+    (tmp_path / "splats.ply").unlink()
+    panel.press(button)
+    panel.client.send_file_download.assert_called_once()

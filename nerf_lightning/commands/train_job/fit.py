@@ -112,7 +112,9 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
     log.info(
         "run folder %s: %s of %d rays, %s parameters, %s, %s",
         folder.path,
-        f"{job.num_steps} steps" if seconds is None else f"{spoken(seconds)} (budget.seconds) of steps",
+        f"{job.num_steps:,} step{'s' * (job.num_steps != 1)}"
+        if seconds is None
+        else f"{spoken(seconds)} (budget.seconds) of steps",
         job.data.batches.batch_rays,
         f"{parameters:,}",
         job.settings.describe(),

@@ -18,7 +18,7 @@ from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.auth import names_of
 from nerf_lightning.viewer.page import Page, require_viser
-from nerf_lightning.viewer.ports import require_address
+from nerf_lightning.viewer.ports import require_address, tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -102,7 +102,7 @@ class LiveView(Callback):
         self.page = Page(RenderQueue(renderer), photographs, folder, *where, self.switch)
         self.last = self.refreshed = time.perf_counter()
         # Its token is for this terminal: others may read train.log.
-        print(f"Watch the training at {self.page.address}", flush=True)
+        print(f"Watch the training at {self.page.address}{tunnel(self.page.address)}", flush=True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
