@@ -51,6 +51,8 @@ class Checkpoint:
     """As they were before training refined them; None where it did not."""
     weights: dict[str, Tensor]
     """The model's state dict."""
+    correction: dict[str, Tensor]
+    """The state dict of the correction."""
     step: int
     """Optimizer steps of the run."""
     precision: str
@@ -66,9 +68,16 @@ class Checkpoint:
         Raises:
             InputError: with the first tensor that is missing, unknown, of another shape or dtype, or not finite.
         """
+        self._load(self.weights, model, "weights")
+
+    def load_correction(self, correction: nn.Module) -> None:
+        """Put the correction's weights into one that was fitted to the scene; raises as `load_weights` does."""
+        self._load(self.correction, correction, "correction")
+
+    def _load(self, state: dict[str, Tensor], module: nn.Module, name: str) -> None:
         with reading(self.path, OTHER_MODEL):
-            model.load_state_dict(self.weights)  # keys and shapes, which some parts take from the file
-            require_like(self.weights, model.state_dict(), "weights")
+            module.load_state_dict(state)  # keys and shapes, which some parts take from the file
+            require_like(state, module.state_dict(), name)
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -115,7 +124,7 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
 
 def checkpoint_of(content: dict[str, Any], path: Path) -> Checkpoint:
     """Return the content of a checkpoint as what it says; `path` is where it lies."""
-    record, prefix = content[KEY], "model."
+    record = content[KEY]
     with reading(path, _instead_of(path)):
         state = content["state_dict"] | (dequantized(record["quantized"], str(path)) if "quantized" in record else {})
     scene, refined = scene_of(record), Cameras(**record["refined"]) if "refined" in record else None
@@ -125,13 +134,18 @@ def checkpoint_of(content: dict[str, Any], path: Path) -> Checkpoint:
         choices=record["choices"],
         scene=scene if refined is None else replace(scene, cameras=refined),
         given_cameras=None if refined is None else scene.cameras,
-        weights={k[len(prefix) :]: value for k, value in state.items() if k.startswith(prefix)},
+        weights=_part(state, "model."),
+        correction=_part(state, "correction."),
         step=content["global_step"],
         precision=record["precision"],
         tile_points=record["tile_points"],
         good=record.get("bad_steps", [0, 0])[-1] == 0,
         record=record,
     )
+
+
+def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
 
 
 def read_content(path: Path) -> dict[str, Any]:

@@ -8,15 +8,16 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.samplers.base import Sampler
 
-CONTRACTS = (Encoder, Field, Sampler, Level, Model)
+CONTRACTS = (Encoder, Field, Sampler, Level, Model, Correction)
 ROOMS = (
-    *(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models")),
+    *(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models", "corrections")),
     "nerf_lightning.extensions.",
 )
 LARGEST_NUMBER = 1 << 53

@@ -1,23 +1,28 @@
 """Export a trained scene as a page, mesh, points, splats, volume, depth maps or cameras."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from omegaconf import DictConfig
+from torch import Tensor
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.export.base import Export, PageExtras
+from nerf_lightning.export.base import Export, Neutral, PageExtras
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field
+from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
@@ -67,7 +72,7 @@ def write_files(
     """Export an opened model into a folder, which is there, and return the files."""
     record = opened.checkpoint.scene
     content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
-    what.beside = beside(opened.checkpoint, photographs, path if what.plays_path else None, content)
+    what.beside = beside(opened, photographs, path if what.plays_path else None, content)
     if opened.model.needs_photographs:
         record = scene_record(scene_to_look_at(opened, None))
     with torch.no_grad():
@@ -75,12 +80,13 @@ def write_files(
 
 
 def beside(
-    checkpoint: Checkpoint,
+    opened: LoadedModel,
     photographs: Scene | None,
     path: CameraPath | None,
     content: Content,
 ) -> PageExtras:
     """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path."""
+    checkpoint = opened.checkpoint
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
         ("model", checkpoint.choices.get("model", "")),
@@ -88,9 +94,26 @@ def beside(
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
+    neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None
     keyframes = () if path is None else page_path(path, checkpoint.scene, run, content)
     name = scene_name({"scene": checkpoint.scene.name}, checkpoint.choices, read_run(run).overrides)
-    return PageExtras(photographs, corrected, tuple(known), keyframes, name)
+    return PageExtras(photographs, neutral, tuple(known), keyframes, name)
+
+
+def neutral_colors(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Neutral:
+    """Return what takes photographs to the colors that a model shows, whose correction has learned how they differ."""
+    if not checkpoint.correction:  # Pruned checkpoints keep the model alone.
+        return lambda rgb, name: None
+    correction, scene = load_correction(checkpoint, trusted), checkpoint.scene
+
+    def neutral(rgb: Float[Tensor, "height width 3"], name: str) -> Float[Tensor, "height width 3"] | None:
+        height, width, _ = rgb.shape
+        view = scene.view_names.index(name)
+        full = scene.cameras.width[view] / width, scene.cameras.height[view] / height
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        return correction.neutral(rgb, PixelIndex(torch.full_like(x, view), (x * full[0]).long(), (y * full[1]).long()))
+
+    return neutral
 
 
 def page_path(

@@ -14,6 +14,7 @@ from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.samplers.base import Sampler
@@ -31,11 +32,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     Raises:
         InputError: the config names anything else, or the weights do not fit.
     """
-    config = plain_yaml(checkpoint.config, f"The config in {checkpoint.path}")
-    if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-        raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part. Use another one.")
-    config = config["model"]
-    require_trusted(config, str(checkpoint.path), trusted)
+    config = _config_of(checkpoint, "model", trusted)
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
         shapes = build_model(config, checkpoint)
@@ -57,6 +54,31 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     return model.eval()
 
 
+def load_correction(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Correction:
+    """Build the correction that a checkpoint describes, with what it learned of each photograph, as `load_model` does.
+
+    Raises:
+        InputError: the config names anything else, or the weights do not fit.
+    """
+    config = _config_of(checkpoint, "correction", trusted)
+    correction = _built(config, "correction", checkpoint)
+    if not isinstance(correction, Correction):
+        kind = type(correction).__name__
+        raise InputError(f"{checkpoint.path}: its correction part describes a {kind}, not a correction.")
+    correction.fit_to(checkpoint.scene)
+    checkpoint.load_correction(correction)
+    return correction.eval()
+
+
+def _config_of(checkpoint: Checkpoint, part: str, trusted: Sequence[str]) -> dict[str, Any]:
+    config = plain_yaml(checkpoint.config, f"The config in {checkpoint.path}")
+    if not isinstance(config, dict) or not isinstance(config.get(part), dict):
+        raise InputError(f"{checkpoint.path} is damaged: its config has no readable {part} part. Use another one.")
+    found: dict[str, Any] = config[part]
+    require_trusted(found, str(checkpoint.path), trusted)
+    return found
+
+
 def hold_to_budgets(model: Model, where: str) -> None:
     """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
 
@@ -72,12 +94,16 @@ def hold_to_budgets(model: Model, where: str) -> None:
 
 def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
     """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`)."""
-    try:
-        require_fitting_values(config, "model")
-        model = instantiate(config, _convert_="all")
-    except HydraException as error:
-        reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise InputError(f"{checkpoint.path}: its model part cannot be built: {reason}. Use another one.") from error
+    model = _built(config, "model", checkpoint)
     if not isinstance(model, Model):
         raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
     return model
+
+
+def _built(config: dict[str, Any], part: str, checkpoint: Checkpoint) -> Any:
+    try:
+        require_fitting_values(config, part)
+        return instantiate(config, _convert_="all")
+    except HydraException as error:
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise InputError(f"{checkpoint.path}: its {part} part cannot be built: {reason}. Use another one.") from error

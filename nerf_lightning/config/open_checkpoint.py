@@ -30,6 +30,8 @@ class LoadedModel:
     settings: ComputeSettings
     checkpoint: Checkpoint
     model: Model
+    trusted: Sequence[str] = ()
+    """Modules of the person's own, whose parts may be built."""
 
     @property
     def tile_points(self) -> int:
@@ -55,7 +57,7 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     settings.keep_tile(checkpoints[0].tile_points)
     models = (load_model(each, trusted) for each in checkpoints)
     ready = [model.to(settings.device) if float32 else settings.prepare(model) for model in models]
-    return [LoadedModel(settings, *each) for each in zip(checkpoints, ready, strict=True)]
+    return [LoadedModel(settings, *each, trusted) for each in zip(checkpoints, ready, strict=True)]
 
 
 def trusted_modules(trust: Any) -> list[str]:

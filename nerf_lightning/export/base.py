@@ -7,6 +7,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
@@ -14,6 +17,8 @@ from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 Report = Callable[[str, float], None]
 """Takes the name of a stage, and how much of it is done, from 0 to 1."""
+Neutral = Callable[[Float[Tensor, "height width 3"], str], Float[Tensor, "height width 3"] | None]
+"""Takes the colors of a photograph and its name to the model's neutral colors, or to None where that is not known."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +27,8 @@ class PageExtras:
 
     photographs: Scene | None = None
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
-    corrected: bool = False
-    """Whether the model learned what each camera makes of its colors, which then are not the photographs'."""
+    neutral: Neutral | None = None
+    """Takes back what the model's correction learned of each photograph; None: there is none to take back."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
     keyframes: tuple[dict[str, Any], ...] = ()

@@ -26,8 +26,8 @@ class PageExport(SplatFitting):
     Args:
         num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
             pixels, at most 150,000.
-        seconds: seconds of fitting the splats to the training photographs; without them, or if the model has a
-            correction per photograph, to renders of the field; 0: no fitting.
+        seconds: seconds of fitting the splats to the training photographs; without them, to renders of the
+            field; 0: no fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
         longest: maximum length of the longer side of the images used for fitting, in pixels.
         max_views: maximum number of held-out views on which the page is compared with the model; 0: none.

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.profilers import SimpleProfiler
+from omegaconf import OmegaConf
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.compute import ranks
@@ -68,7 +70,9 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
     try:
         # From the file, as nerf export does: what was trained in bfloat16 is read in float32.
         checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
-        trained = LoadedModel(job.settings, checkpoint, load_model(checkpoint).to(job.settings.device).eval())
+        parts = [OmegaConf.to_container(part, resolve=True) for part in (job.config.model, job.config.correction)]
+        own = modules_to_trust(parts)
+        trained = LoadedModel(job.settings, checkpoint, load_model(checkpoint, own).to(job.settings.device), own)
         path = job.config.path.copy()
         path.update(PATH)
         target = make_folder(folder, "export")

@@ -1,6 +1,7 @@
 // ---- The scene as 3D Gaussian splats (Kerbl et al. 2023), drawn from the farthest to the nearest ----------------
 
 const BUCKETS = 1 << 16;  // Of distances, by their logarithms.
+const FLOATS = 10;  // Of a splat in the picture: spot, arms, shade of project.vert.
 
 // The planes of bytes of quantized.py: places, and for each splat texels of quaternion, sizes and opacity, color, harmonics.
 function splatsOf(about, content) {
@@ -35,30 +36,32 @@ class Picture {
     this.splats = splatsOf(about, content);
     const { count } = this.splats;
     Object.assign(this, { depths: new Float32Array(count), order: new Uint32Array(count), starts: new Uint32Array(BUCKETS + 1) });
-    this.program = this.linked();
-    gl.useProgram(this.program);
+    this.projection = this.linked("project", null, ["splat"], ["spot", "arms", "shade"]);
+    this.quads = this.linked("quad", "tint", ["spot", "arms", "shade"]);
     gl.disable(gl.DITHER);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     this.upload();
   }
 
-  linked() {
+  // Attributes are numbered in their order; `kept`: what is written to a buffer instead of being drawn.
+  linked(vertices, pixels, attributes, kept = null) {
     const gl = this.gl, program = gl.createProgram(), head = `#version 300 es\n#define DEGREE ${this.about.degree}\n`;
-    for (const [kind, id] of [[gl.VERTEX_SHADER, "vertices"], [gl.FRAGMENT_SHADER, "pixels"]]) {
+    for (const [kind, id] of [[gl.VERTEX_SHADER, vertices], [gl.FRAGMENT_SHADER, pixels]]) {
       const shader = gl.createShader(kind);
-      gl.shaderSource(shader, head + byId(id).textContent);
+      gl.shaderSource(shader, head + (id === null ? "void main() {}" : byId(id).textContent));
       gl.compileShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getShaderInfoLog(shader)}`);
       gl.attachShader(program, shader);
     }
-    gl.bindAttribLocation(program, 0, "splat");
+    attributes.forEach((name, number) => gl.bindAttribLocation(program, number, name));
+    if (kept !== null) gl.transformFeedbackVaryings(program, kept, gl.INTERLEAVED_ATTRIBS);
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getProgramInfoLog(program)}`);
     return program;
   }
 
-  at(name) { return this.gl.getUniformLocation(this.program, name); }
+  at(name, program = this.projection) { return this.gl.getUniformLocation(program, name); }
 
   upload() {
     const gl = this.gl, { count, texels, places, bytes } = this.splats, { about } = this;
@@ -67,18 +70,42 @@ class Picture {
     const wide = new Float32Array(4 * across * down), padded = new Uint8Array(4 * texels * across * down);
     for (let i = 0; i < count; i++) wide.set(places.subarray(3 * i, 3 * i + 3), 4 * i);
     padded.set(bytes);
+    gl.useProgram(this.projection);
     this.texture(0, "places", gl.RGBA32F, across, down, gl.FLOAT, wide);
     this.texture(1, "bytes", gl.RGBA8, across * texels, down, gl.UNSIGNED_BYTE, padded);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * count, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    this.numbers = this.buffer(4 * count);
+    this.splat = this.arrays(() => {
+      gl.enableVertexAttribArray(0);
+      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    });
+    this.projected = this.buffer(FLOATS * 4 * count);
+    this.quad = this.arrays(() => [2, 4, 4].reduce((before, length, number) => {
+      gl.enableVertexAttribArray(number);
+      gl.vertexAttribPointer(number, length, gl.FLOAT, false, FLOATS * 4, 4 * before);
+      gl.vertexAttribDivisor(number, 1);
+      return before + length;
+    }, 0));
     gl.uniform1i(this.at("across"), across);
     gl.uniform2fv(this.at("scales"), about.scales);
     gl.uniform2fv(this.at("colors"), about.colors);
     gl.uniform1f(this.at("harmonics"), about.harmonics);
     if (gl.getError() !== gl.NO_ERROR) throw new Refusal("This device has too little graphics memory for the scene. Ask for a file with fewer splats (what.num_splats=100000).");
+  }
+
+  buffer(length) {
+    const gl = this.gl, buffer = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, length, gl.DYNAMIC_DRAW);
+    return buffer;
+  }
+
+  // What the attributes are, of the buffer that was made last.
+  arrays(describe) {
+    const gl = this.gl, arrays = gl.createVertexArray();
+    gl.bindVertexArray(arrays);
+    describe();
+    gl.bindVertexArray(null);
+    return arrays;
   }
 
   texture(number, name, format, width, height, type, values) {
@@ -117,6 +144,7 @@ class Picture {
     if (this.canvas.height !== height) this.canvas.height = height;
     const { focal, center } = lensIn(view, width, height), away = length(minus(view.eye, this.about.middle));
     gl.viewport(0, 0, width, height);
+    gl.useProgram(this.projection);
     gl.uniform2f(this.at("size"), width, height);
     gl.uniform2fv(this.at("focal"), focal);
     gl.uniform2fv(this.at("center"), center);
@@ -126,10 +154,30 @@ class Picture {
     gl.uniform1i(this.at("shown"), view.shown);
     gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
     const drawn = this.sort(view);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, drawn);
+    this.project(drawn);
+    gl.useProgram(this.quads);
+    gl.uniform2f(this.at("size", this.quads), width, height);
     gl.clearColor(...view.behind, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.bindVertexArray(this.quad);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, drawn);
+    gl.bindVertexArray(null);
+  }
+
+  // Once a splat, not once a corner: this is what drawing costs where a processor stands in for graphics.
+  project(drawn) {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.numbers);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, drawn);
+    gl.bindBuffer(gl.ARRAY_BUFFER, null);
+    gl.bindVertexArray(this.splat);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);
+    gl.enable(gl.RASTERIZER_DISCARD);
+    gl.beginTransformFeedback(gl.POINTS);
+    gl.drawArrays(gl.POINTS, 0, drawn);
+    gl.endTransformFeedback();
+    gl.disable(gl.RASTERIZER_DISCARD);
+    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
   }
 
   // In a finer picture than the photographs' splats are wider by as much: they touch as they did in the fitting.

@@ -29,8 +29,8 @@ class SplatsExport(SplatFitting):
     Args:
         num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
             pixels, at most 150,000.
-        seconds: seconds of fitting to the training photographs; without them, or if the model has a correction per
-            photograph, to renders of the field; 0: no fitting.
+        seconds: seconds of fitting to the training photographs; without them, to renders of the field; 0: no
+            fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
         format: the file format: ply, spz (a sixth of the size) or glb (glTF with KHR_gaussian_splatting). SPZ needs
             `pip install 'nerf-lightning[splats]'`.

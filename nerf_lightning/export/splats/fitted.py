@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from nerf_lightning.export.base import Export, Report, require_kernels, require_setting
+from nerf_lightning.export.base import Export, Neutral, Report, require_kernels, require_setting
 from nerf_lightning.export.splats.fit import Fitting, fit
 from nerf_lightning.export.splats.gaussians import Gaussians
 from nerf_lightning.export.splats.initialize import initial_gaussians, look_around
@@ -14,6 +14,7 @@ from nerf_lightning.export.splats.views import View, photographed, without_lens
 from nerf_lightning.nerf.geometry.panoramas import faces_of_panoramas
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
+from nerf_lightning.visualization.pictures import to_bytes
 
 ROOM = "nerf_lightning.export.splats"
 KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
@@ -70,11 +71,12 @@ class SplatFitting(Export):
     def fitted(self, model: Model, record: SceneRecord, tile_points: int, report: Report) -> FittedSplats:
         """Return splats that begin on the field's surfaces, fitted to the photographs.
 
-        Without photographs, or if the model has a correction for each, they are fitted to renders of the field.
+        Without photographs they are fitted to renders of the field; so they are if the model has a correction for each
+        photograph that cannot be taken back.
         """
         for module in self.kernels:
             require_kernels(module, "Fitting splats")
-        photographs = None if self.beside.corrected else self.beside.photographs
+        photographs = self._photographs(record)
         if record.cameras.lens_model == "equirectangular":
             record, photographs = as_faces(record), None
         scene = record if photographs is None else photographs
@@ -84,11 +86,16 @@ class SplatFitting(Export):
         first = max(1, budget // 2) if self.seconds else budget
         gaussians = initial_gaussians(around, first, self.sh_degree, self.seed)
         if self.seconds:
-            views = [] if photographs is None else training_views(record, photographs, pinholes)
+            views = [] if photographs is None else training_views(record, photographs, pinholes, self.beside.neutral)
             fitting = Fitting(budget, self.seconds, record.background, extent(pinholes), self.seed)
             with torch.enable_grad():
                 gaussians = fit(gaussians, views, around.views(), fitting, report)
         return FittedSplats(gaussians, scene, pinholes, "the field" if photographs is None else "photographs")
+
+    def _photographs(self, record: SceneRecord) -> Scene | None:
+        neutral, name = self.beside.neutral, record.view_names[record.splits["train"][0]]
+        unknown = neutral is not None and neutral(torch.zeros(1, 1, 3), name) is None
+        return None if unknown else self.beside.photographs
 
     def _budget(self, pinholes: Cameras) -> int:
         pixels = int((pinholes.width * pinholes.height).double().mean())
@@ -108,12 +115,23 @@ def as_faces(record: SceneRecord) -> SceneRecord:
     )
 
 
-def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras) -> list[View]:
-    """Return the photographs that the model learned from, by its record, and of which anything counts."""
+def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral: Neutral | None = None) -> list[View]:
+    """Return the photographs that the model learned from, by its record, and of which anything counts.
+
+    `neutral` takes back what its correction learned of each.
+    """
     trained = {record.view_names[view] for view in record.splits["train"]}
     known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
-    views = [photographed(scene, view, pinholes) for view in known]
-    return [view for view in views if view.kept is None or bool(view.kept.any())]
+    views = []
+    for number in known:
+        view = photographed(scene, number, pinholes)
+        if neutral is not None:
+            rgb = neutral(view.rgba[..., :3] / 255.0, scene.view_names[number])
+            assert rgb is not None  # or nothing would be fitted to photographs
+            view = replace(view, rgba=torch.cat([to_bytes(rgb), view.rgba[..., 3:]], dim=-1))
+        if view.kept is None or bool(view.kept.any()):
+            views.append(view)
+    return views
 
 
 def extent(cameras: Cameras) -> float:

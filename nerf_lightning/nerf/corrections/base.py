@@ -11,7 +11,7 @@ from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.renderings import Rendering
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Correction(Part, ABC):
@@ -25,7 +25,7 @@ class Correction(Part, ABC):
     replays: bool = False
     """True where it does the same in each step, so that a recording of it (trainer.cuda_graph) can be replayed."""
 
-    def fit_to(self, scene: Scene) -> None:
+    def fit_to(self, scene: SceneRecord) -> None:
         """Take note of the photographs, once, before training.
 
         Raises:
@@ -58,13 +58,20 @@ class Correction(Part, ABC):
             pixels: where in which photograph each color stands.
         """
 
+    def neutral(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"] | None:
+        """Return the neutral colors of what photographs show, the inverse of `forward`; None: it is not known.
+
+        Splats are fitted to such photographs.
+        """
+        return None
+
 
 class NoCorrection(Correction):
     """Leave every color as it is: photographs show what there is."""
 
     replays = True
 
-    def fit_to(self, scene: Scene) -> None:
+    def fit_to(self, scene: SceneRecord) -> None:
         """Take any scene."""
 
     def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
@@ -72,5 +79,9 @@ class NoCorrection(Correction):
         return rendering
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
+        """Return the colors themselves."""
+        return rgb
+
+    def neutral(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
         """Return the colors themselves."""
         return rgb

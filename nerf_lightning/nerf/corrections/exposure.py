@@ -8,7 +8,7 @@ from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 from nerf_lightning.nerf.types.rays import PixelIndex
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Exposure(Correction):
@@ -35,7 +35,7 @@ class Exposure(Correction):
         """Of each view: exposure, red, blue."""
         self.register_buffer("trained", torch.zeros(1, dtype=torch.int64), persistent=False)
 
-    def fit_to(self, scene: Scene) -> None:
+    def fit_to(self, scene: SceneRecord) -> None:
         """Make room for each photograph.
 
         Raises:
@@ -48,6 +48,10 @@ class Exposure(Correction):
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
         """Return the colors with their light scaled by the gains of their photographs."""
         return scale_light(rgb, self.gains()[pixels.view])
+
+    def neutral(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
+        """Return the colors with their light divided by the gains of their photographs."""
+        return scale_light(rgb, 1.0 / self.gains()[pixels.view])
 
     def gains(self) -> Float[Tensor, "views 3"]:
         """Return the factors on the linear light of red, green and blue in each photograph."""

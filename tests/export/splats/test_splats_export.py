@@ -8,22 +8,28 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from support.command_fixtures import *  # noqa: F403
+from support.configs import composed
 from support.known_fields import ball, photographed_ball, solid
-from support.planted import write_checkpoint
+from support.planted import in_config, write_checkpoint
 from support.running import said
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.reading import read_checkpoint, scene_record
+from nerf_lightning.commands.export import neutral_colors
+from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.export import base
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.export.splats.export import SplatsExport
 from nerf_lightning.export.splats.fit import LEAST_VARIANCE
+from nerf_lightning.export.splats.fitted import training_views
 from nerf_lightning.export.splats.views import photographed, without_lens
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+from nerf_lightning.nerf.rendering.linear_light import scale_light, to_linear
 
 TILE = 1 << 15
 
@@ -56,6 +62,29 @@ def test_without_photographs_the_field_is_what_they_are_fitted_to(tmp_path):
     assert fitted["fitted_to"] == "the field"
     assert "field_metrics" not in fitted
     assert fitted["splats_metrics"]["psnr"] > begun["splats_metrics"]["psnr"] + 3.0
+
+
+def test_photographs_of_a_corrected_model_are_made_neutral_first(tmp_path):
+    config = OmegaConf.to_container(composed("train", "correction=exposure").correction)
+    stops = torch.zeros(6, 3)
+    stops[2] = torch.tensor([1.0, 0.0, 0.0])
+
+    def corrected(content):
+        in_config(lambda plain: plain.update(correction=config))(content)
+        content["state_dict"]["correction.stops"] = stops
+
+    checkpoint = read_checkpoint(write_checkpoint(tmp_path / "a.ckpt", corrected))
+    neutral, rgb = neutral_colors(checkpoint), torch.rand(4, 4, 3)
+    torch.testing.assert_close(neutral(scale_light(rgb, torch.tensor(2.0)), "ball_2"), rgb)
+    scene, _ = photographed_ball(16)
+    pinholes = without_lens(scene.cameras, 100)
+    plain, dark = (training_views(checkpoint.scene, scene, pinholes, each)[2].rgba for each in (None, neutral))
+    light = [float(to_linear(rgba[..., :3] / 255.0).sum()) for rgba in (plain, dark)]
+    assert light[1] == pytest.approx(0.5 * light[0], rel=0.02)
+    assert neutral_colors(replace(checkpoint, correction={}))(rgb, "ball_2") is None
+    foreign = in_config(lambda plain: plain.update(correction={"_target_": "os.getcwd"}))
+    with pytest.raises(InputError, match="is not a model part of this program"):
+        load_correction(read_checkpoint(write_checkpoint(tmp_path / "b.ckpt", foreign)))
 
 
 def test_splats_lie_on_the_surface_in_the_captures_frame_and_none_is_haze(tmp_path):

@@ -61,7 +61,7 @@ def test_it_learns_from_the_photographs_that_train_and_only_of_them(option):
 
 
 @pytest.mark.parametrize("option", LEARNT)
-def test_gradients_are_finite_for_whatever_colours(option):
+def test_gradients_are_finite_for_whatever_colours_and_what_is_taken_back_is_what_was_there(option):
     scene = ball_scene()
     correction = correction_of(option, scene)
     with torch.no_grad():
@@ -71,6 +71,8 @@ def test_gradients_are_finite_for_whatever_colours(option):
     view, x, y = (torch.arange(6), torch.tensor([0, 3, 6, 9, 11, 0]), torch.tensor([0, 11, 0, 5, 6, 11]))
     shown = correction(rgb, PixelIndex(view, x, y))
     assert not torch.allclose(shown, rgb)
+    back = correction.neutral(shown, PixelIndex(view, x, y))
+    assert back is None or torch.allclose(back, rgb, atol=1e-5)
     shown.sum().backward()
     for tensor in (shown, rgb.grad, *(parameter.grad for parameter in correction.parameters())):
         assert bool(torch.isfinite(tensor).all())

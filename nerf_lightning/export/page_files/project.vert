@@ -1,4 +1,5 @@
-// One splat as a quad, as gaussians.py has it: J W S W^T J^T + dilation, in pixels, and its color from here.
+// One splat in the picture, as gaussians.py has it: J W S W^T J^T + dilation, in pixels, and its color from here.
+// Written to a buffer, once a splat: quad.vert draws it.
 precision highp float;
 precision highp int;
 
@@ -11,8 +12,9 @@ uniform float dilation, harmonics;
 uniform int shown;
 
 in uint splat;
-out vec2 place;  // In standard deviations.
-flat out vec4 shade;
+out vec2 spot;   // Its middle (pixels).
+out vec4 arms;   // Half the sides of its quad (pixels).
+out vec4 shade;  // Color and opacity; opacity 0: not drawn.
 
 const int TEXELS = 3 + (3 * ((DEGREE + 1) * (DEGREE + 1) - 1) + 3) / 4;
 
@@ -62,7 +64,8 @@ vec3 harmonic_color(vec3 look) {
 }
 
 void main() {
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // Not drawn.
+  spot = vec2(0.0);
+  arms = shade = vec4(0.0);
   vec3 mean = texelFetch(places, ivec2(int(splat) % across, int(splat) / across), 0).xyz;
   vec3 local = (mean - eye) * turn, look = normalize(mean - eye);
   vec4 form = texel(1);
@@ -80,10 +83,9 @@ void main() {
   float middle = 0.5 * (xx + yy), radius = length(vec2(0.5 * (xx - yy), xy));
   vec2 axis = radius > 1e-6 * middle ? vec2(middle + radius - yy, xy) : vec2(1.0, 0.0);
   axis = dot(axis, axis) > 1e-12 * middle * middle ? normalize(axis) : vec2(0.0, 1.0);
-  place = (vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0) * sqrt(2.0 * log(255.0 * form.w));
-  vec2 offset = place.x * sqrt(middle + radius) * axis + place.y * sqrt(max(middle - radius, dilation)) * vec2(-axis.y, axis.x);
-  vec2 at = vec2(center.x, size.y - center.y) + focal * local.xy / away + offset;
-  gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
+  float reach = sqrt(2.0 * log(255.0 * form.w));
+  arms = reach * vec4(sqrt(middle + radius) * axis, sqrt(max(middle - radius, dilation)) * vec2(-axis.y, axis.x));
+  spot = vec2(center.x, size.y - center.y) + focal * local.xy / away;
 
   vec3 color;
   if (shown == 1) {
