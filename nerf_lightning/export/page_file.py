@@ -36,8 +36,7 @@ from nerf_lightning.visualization.pictures import to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
-SHADERS = {"project": "project.vert", "quad": "quad.vert", "tint": "quad.frag"}
-"""By the ids of their elements."""
+SHADERS = ("splats.vert", "splats.frag")
 MARK = b"<!-- nerf_lightning page 1 -->"
 NEAR_NDC = 0.2  # Of the distance at which content begins.
 INSIDE = 0.01  # So large a share of the splats lies beyond either side of the box that one turns around.
@@ -112,7 +111,9 @@ def write_page(
         "still": _jpeg(_still(shown, record, first), STILL),
         "background": BEHIND[at_evaluation(record.background)],
     }
-    style, *scripts = (_page_file(name) for name in ("page.css", *SCRIPTS))
+    style, vertices, pixels, *scripts = (
+        (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", *SHADERS, *SCRIPTS)
+    )
     script = "\n".join(scripts)
     # Nothing in a text may end the element that it stands in.
     about_text = json.dumps(about).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -123,15 +124,12 @@ def write_page(
         about=Markup(about_text),
         script=Markup(script),
         style=Markup(style),
-        shaders=[(name, Markup(_page_file(file))) for name, file in SHADERS.items()],
+        vertices=Markup(vertices),
+        pixels=Markup(pixels),
         splats=Markup(base64.b64encode(packed).decode()),
     )
     with whole_file(target) as part:
         part.write_text(text, encoding="utf-8")
-
-
-def _page_file(name: str) -> str:
-    return (FOLDER / name).read_text(encoding="utf-8")
 
 
 def is_page(path: Path) -> bool:

@@ -1,7 +1,6 @@
 // ---- The scene as 3D Gaussian splats (Kerbl et al. 2023), drawn from the farthest to the nearest ----------------
 
 const BUCKETS = 1 << 16;  // Of distances, by their logarithms.
-const FLOATS = 10;  // Of a splat in the picture: spot, arms, shade of project.vert.
 
 // The planes of bytes of quantized.py: places, and for each splat texels of quaternion, sizes and opacity, color, harmonics.
 function splatsOf(about, content) {
@@ -35,33 +34,30 @@ class Picture {
     }
     this.splats = splatsOf(about, content);
     const { count } = this.splats;
-    Object.assign(this, { depths: new Float32Array(count), order: new Uint32Array(count), starts: new Uint32Array(BUCKETS + 1) });
-    this.projection = this.linked("project", null, ["splat"], ["spot", "arms", "shade"]);
-    this.quads = this.linked("quad", "tint", ["spot", "arms", "shade"]);
+    Object.assign(this, { depths: new Float32Array(count), starts: new Uint32Array(BUCKETS + 1) });
+    this.program = this.linked();
+    gl.useProgram(this.program);
     gl.disable(gl.DITHER);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     this.upload();
   }
 
-  // Attributes are numbered in their order; `kept`: what is written to a buffer instead of being drawn.
-  linked(vertices, pixels, attributes, kept = null) {
+  linked() {
     const gl = this.gl, program = gl.createProgram(), head = `#version 300 es\n#define DEGREE ${this.about.degree}\n`;
-    for (const [kind, id] of [[gl.VERTEX_SHADER, vertices], [gl.FRAGMENT_SHADER, pixels]]) {
+    for (const [kind, id] of [[gl.VERTEX_SHADER, "vertices"], [gl.FRAGMENT_SHADER, "pixels"]]) {
       const shader = gl.createShader(kind);
-      gl.shaderSource(shader, head + (id === null ? "void main() {}" : byId(id).textContent));
+      gl.shaderSource(shader, head + byId(id).textContent);
       gl.compileShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getShaderInfoLog(shader)}`);
       gl.attachShader(program, shader);
     }
-    attributes.forEach((name, number) => gl.bindAttribLocation(program, number, name));
-    if (kept !== null) gl.transformFeedbackVaryings(program, kept, gl.INTERLEAVED_ATTRIBS);
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getProgramInfoLog(program)}`);
     return program;
   }
 
-  at(name, program = this.projection) { return this.gl.getUniformLocation(program, name); }
+  at(name) { return this.gl.getUniformLocation(this.program, name); }
 
   upload() {
     const gl = this.gl, { count, texels, places, bytes } = this.splats, { about } = this;
@@ -70,21 +66,15 @@ class Picture {
     const wide = new Float32Array(4 * across * down), padded = new Uint8Array(4 * texels * across * down);
     for (let i = 0; i < count; i++) wide.set(places.subarray(3 * i, 3 * i + 3), 4 * i);
     padded.set(bytes);
-    gl.useProgram(this.projection);
-    this.texture(0, "places", gl.RGBA32F, across, down, gl.FLOAT, wide);
-    this.texture(1, "bytes", gl.RGBA8, across * texels, down, gl.UNSIGNED_BYTE, padded);
-    this.numbers = this.buffer(4 * count);
-    this.splat = this.arrays(() => {
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    });
-    this.projected = this.buffer(FLOATS * 4 * count);
-    this.quad = this.arrays(() => [2, 4, 4].reduce((before, length, number) => {
-      gl.enableVertexAttribArray(number);
-      gl.vertexAttribPointer(number, length, gl.FLOAT, false, FLOATS * 4, 4 * before);
-      gl.vertexAttribDivisor(number, 1);
-      return before + length;
-    }, 0));
+    this.texture(0, "places", gl.RGBA32F, across, down, gl.RGBA, gl.FLOAT, wide);
+    this.texture(1, "bytes", gl.RGBA8, across * texels, down, gl.RGBA, gl.UNSIGNED_BYTE, padded);
+    this.order = new Uint32Array(across * down);
+    this.texture(2, "order", gl.R32UI, across, down, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order);
+    Object.assign(this, { across, down });
+    // Two triangles each, not an instance each: a processor that stands in for graphics draws instances one by one.
+    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.uniform1i(this.at("across"), across);
     gl.uniform2fv(this.at("scales"), about.scales);
     gl.uniform2fv(this.at("colors"), about.colors);
@@ -92,28 +82,12 @@ class Picture {
     if (gl.getError() !== gl.NO_ERROR) throw new Refusal("This device has too little graphics memory for the scene. Ask for a file with fewer splats (what.num_splats=100000).");
   }
 
-  buffer(length) {
-    const gl = this.gl, buffer = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, length, gl.DYNAMIC_DRAW);
-    return buffer;
-  }
-
-  // What the attributes are, of the buffer that was made last.
-  arrays(describe) {
-    const gl = this.gl, arrays = gl.createVertexArray();
-    gl.bindVertexArray(arrays);
-    describe();
-    gl.bindVertexArray(null);
-    return arrays;
-  }
-
-  texture(number, name, format, width, height, type, values) {
+  texture(number, name, format, width, height, channels, type, values) {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0 + number);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
     for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, type, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, channels, type, values);
     gl.uniform1i(this.at(name), number);
   }
 
@@ -144,7 +118,6 @@ class Picture {
     if (this.canvas.height !== height) this.canvas.height = height;
     const { focal, center } = lensIn(view, width, height), away = length(minus(view.eye, this.about.middle));
     gl.viewport(0, 0, width, height);
-    gl.useProgram(this.projection);
     gl.uniform2f(this.at("size"), width, height);
     gl.uniform2fv(this.at("focal"), focal);
     gl.uniform2fv(this.at("center"), center);
@@ -154,30 +127,10 @@ class Picture {
     gl.uniform1i(this.at("shown"), view.shown);
     gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
     const drawn = this.sort(view);
-    this.project(drawn);
-    gl.useProgram(this.quads);
-    gl.uniform2f(this.at("size", this.quads), width, height);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.across, this.down, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order);
     gl.clearColor(...view.behind, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.bindVertexArray(this.quad);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, drawn);
-    gl.bindVertexArray(null);
-  }
-
-  // Once a splat, not once a corner: this is what drawing costs where a processor stands in for graphics.
-  project(drawn) {
-    const gl = this.gl;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.numbers);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, drawn);
-    gl.bindBuffer(gl.ARRAY_BUFFER, null);
-    gl.bindVertexArray(this.splat);
-    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);
-    gl.enable(gl.RASTERIZER_DISCARD);
-    gl.beginTransformFeedback(gl.POINTS);
-    gl.drawArrays(gl.POINTS, 0, drawn);
-    gl.endTransformFeedback();
-    gl.disable(gl.RASTERIZER_DISCARD);
-    gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+    gl.drawElements(gl.TRIANGLES, 6 * drawn, gl.UNSIGNED_INT, 0);
   }
 
   // In a finer picture than the photographs' splats are wider by as much: they touch as they did in the fitting.

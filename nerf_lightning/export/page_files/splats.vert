@@ -1,9 +1,9 @@
-// One splat in the picture, as gaussians.py has it: J W S W^T J^T + dilation, in pixels, and its color from here.
-// Written to a buffer, once a splat: quad.vert draws it.
+// One splat as a quad, as gaussians.py has it: J W S W^T J^T + dilation, in pixels, and its color from here.
 precision highp float;
 precision highp int;
 
 uniform highp sampler2D places, bytes;
+uniform highp usampler2D order;
 uniform int across;  // Splats in a row of the textures.
 uniform mat3 turn;   // Right, up, back.
 uniform vec3 eye;
@@ -11,15 +11,15 @@ uniform vec2 focal, center, size, scales, colors, depths;
 uniform float dilation, harmonics;
 uniform int shown;
 
-in uint splat;
-out vec2 spot;   // Its middle (pixels).
-out vec4 arms;   // Half the sides of its quad (pixels).
-out vec4 shade;  // Color and opacity; opacity 0: not drawn.
+out vec2 place;  // In standard deviations.
+flat out vec4 shade;
 
 const int TEXELS = 3 + (3 * ((DEGREE + 1) * (DEGREE + 1) - 1) + 3) / 4;
 
+int splat;
+
 vec4 texel(int number) {
-  return texelFetch(bytes, ivec2(int(splat) % across * TEXELS + number, int(splat) / across), 0);
+  return texelFetch(bytes, ivec2(splat % across * TEXELS + number, splat / across), 0);
 }
 
 mat3 rotation(vec4 q) {
@@ -64,9 +64,10 @@ vec3 harmonic_color(vec3 look) {
 }
 
 void main() {
-  spot = vec2(0.0);
-  arms = shade = vec4(0.0);
-  vec3 mean = texelFetch(places, ivec2(int(splat) % across, int(splat) / across), 0).xyz;
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // Not drawn.
+  int number = gl_VertexID >> 2;
+  splat = int(texelFetch(order, ivec2(number % across, number / across), 0).x);
+  vec3 mean = texelFetch(places, ivec2(splat % across, splat / across), 0).xyz;
   vec3 local = (mean - eye) * turn, look = normalize(mean - eye);
   vec4 form = texel(1);
   if (form.w < 1.0 / 255.0) return;
@@ -83,9 +84,10 @@ void main() {
   float middle = 0.5 * (xx + yy), radius = length(vec2(0.5 * (xx - yy), xy));
   vec2 axis = radius > 1e-6 * middle ? vec2(middle + radius - yy, xy) : vec2(1.0, 0.0);
   axis = dot(axis, axis) > 1e-12 * middle * middle ? normalize(axis) : vec2(0.0, 1.0);
-  float reach = sqrt(2.0 * log(255.0 * form.w));
-  arms = reach * vec4(sqrt(middle + radius) * axis, sqrt(max(middle - radius, dilation)) * vec2(-axis.y, axis.x));
-  spot = vec2(center.x, size.y - center.y) + focal * local.xy / away;
+  place = (vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0) * sqrt(2.0 * log(255.0 * form.w));
+  vec2 offset = place.x * sqrt(middle + radius) * axis + place.y * sqrt(max(middle - radius, dilation)) * vec2(-axis.y, axis.x);
+  vec2 at = vec2(center.x, size.y - center.y) + focal * local.xy / away + offset;
+  gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
 
   vec3 color;
   if (shown == 1) {
