@@ -8,14 +8,15 @@ from omegaconf import DictConfig, ListConfig
 from nerf_lightning.files.folders import PACKAGE
 from nerf_lightning.files.html import write_page
 from nerf_lightning.messages.console import say
-from nerf_lightning.messages.errors import require_one_of
+from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
 from nerf_lightning.runs.table import ORDERS, result_table
 from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns, write_csv, write_markdown
+from nerf_lightning.runs.table_latex import write_latex
 from nerf_lightning.runs.table_screen import print_rows
 
-ENDINGS = (".md", ".csv", ".html")
+ENDINGS = (".md", ".csv", ".html", ".tex")
 TEMPLATE = PACKAGE / "report" / "table.html"
 
 
@@ -30,15 +31,17 @@ def run(config: DictConfig) -> int:
     count = len(found.measured)
     title = f"{count} run{'' if count == 1 else 's'}, sorted by {config.sort}"
     out = config.out or config.paths.output_dir
-    written = _write(rows, notes, title, Path(str(out))) if out else []
+    written = _write(rows, notes, title, Path(str(out)), found.measured[0].protocol) if out else []
     print_rows(rows, title, "Widen it, or write all columns to files with out=DIR.")
     say(*notes, *(f"written to  {path}" for path in written))
     return len(rows)
 
 
-def _write(rows: list[Row], notes: list[str], title: str, out: Path) -> list[Path]:
+def _write(rows: list[Row], notes: list[str], title: str, out: Path, protocol: dict[str, Any]) -> list[Path]:
     """Write the file that was asked for, or one of each kind into a folder; return where."""
     is_file = out.suffix in ENDINGS
+    if out.suffix[1:].isalpha() and not is_file and not out.is_dir():
+        raise InputError(f"out={out}: tables are written as {', '.join(ENDINGS)}; a folder gets one of each.")
     folder = output_folder(str(out.parent if is_file else out), Path())
     paths = [folder / out.name] if is_file else [folder / f"table{ending}" for ending in ENDINGS]
     for path in paths:
@@ -46,6 +49,8 @@ def _write(rows: list[Row], notes: list[str], title: str, out: Path) -> list[Pat
             write_csv(rows, path)
         elif path.suffix == ".md":
             write_markdown(rows, path, notes)
+        elif path.suffix == ".tex":
+            write_latex(rows, path, protocol)
         else:
             write_table_page(rows, title, notes, path)
     return paths

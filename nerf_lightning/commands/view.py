@@ -38,7 +38,7 @@ def run(config: DictConfig) -> None:
     exports = exported_files(beside_checkpoint(opened.checkpoint.path, "export"))
     page = Page(queue, photographs, folder, *where, exports=exports)
     stopped = received_stop_signals()
-    say(f"The page is at {page.address} (Ctrl-C stops it){tunnel(page.address)}")
+    say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with
         Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:

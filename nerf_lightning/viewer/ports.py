@@ -53,17 +53,12 @@ def address_of(host: str, port: int) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def tunnel(address: str) -> str:
-    """Return what to add where the address is only this machine's and the reader may sit elsewhere; else nothing.
-
-    >>> os.environ["SSH_CONNECTION"] = "10.0.0.1 50000 10.0.0.2 22"
-    >>> tunnel("http://127.0.0.1:8080/?token=abc")
-    '\\nOver SSH: first run ssh -L 8080:127.0.0.1:8080 MACHINE on your own computer'
-    """
+def tunnel(address: str) -> list[str]:
+    """Return what somebody who is connected over SSH must do first, as a line; nothing for anybody else."""
     found = re.match(r"http://127\.0\.0\.1:(\d+)", address)
     if found is None or "SSH_CONNECTION" not in os.environ:
-        return ""
-    return f"\nOver SSH: first run ssh -L {found[1]}:127.0.0.1:{found[1]} MACHINE on your own computer"
+        return []
+    return [f"Over SSH, first run on your own computer: ssh -L {found[1]}:127.0.0.1:{found[1]} MACHINE"]
 
 
 def _try(host: str, port: int) -> None:

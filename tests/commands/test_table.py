@@ -303,7 +303,18 @@ def test_a_real_run_is_a_row(nerf, finished_run, tmp_path):
     assert float(row["PSNR"]) == metrics["psnr"]
 
 
-FILES = {"table.csv", "table.html", "table.md"}
+def test_latex_has_the_best_in_bold_and_the_protocol_in_its_caption(table, nerf, tmp_path):
+    for number, (model, psnr) in enumerate((("a_b", 30.0), ("a_b", 31.0), ("c", 29.0))):
+        leave_measured_run(tmp_path / "runs" / str(number), psnr, number, origin={"model": model})
+    assert nerf("table", tmp_path / "runs", "published=false", f"out={tmp_path}/t.tex").code == 0
+    text = (tmp_path / "t.tex").read_text()
+    assert r"a\_b & \textbf{30.50 $\pm$ 0.71}" in text
+    assert r"\textbf{29.00}" not in text
+    assert "test views, white background" in text.partition(r"\begin{tabular}")[0]
+    said(nerf("table", tmp_path / "runs", "out=t.pdf"), "out=t.pdf: tables are written as .md, .csv, .html, .tex")
+
+
+FILES = {"table.csv", "table.html", "table.md", "table.tex"}
 
 
 def test_files_are_written_only_where_they_are_asked_for(nerf, tmp_path, monkeypatch):

@@ -123,5 +123,5 @@ def test_over_ssh_the_command_of_the_tunnel_follows_a_local_address(monkeypatch)
     monkeypatch.delenv("SSH_CONNECTION", raising=False)
     assert not ports.tunnel("http://127.0.0.1:8081/?token=a")
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 50000 10.0.0.2 22")
-    assert "ssh -L 8081:127.0.0.1:8081 MACHINE" in ports.tunnel("http://127.0.0.1:8081/?token=a")
+    assert "ssh -L 8081:127.0.0.1:8081 MACHINE" in ports.tunnel("http://127.0.0.1:8081/?token=a")[0]
     assert not ports.tunnel("http://10.0.0.2:8081/?token=a")

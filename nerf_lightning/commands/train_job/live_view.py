@@ -102,7 +102,7 @@ class LiveView(Callback):
         self.page = Page(RenderQueue(renderer), photographs, folder, *where, self.switch)
         self.last = self.refreshed = time.perf_counter()
         # Its token is for this terminal: others may read train.log.
-        print(f"Watch the training at {self.page.address}{tunnel(self.page.address)}", flush=True)
+        print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""

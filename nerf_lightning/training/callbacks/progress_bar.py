@@ -10,11 +10,14 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nerf_lightning.messages.console import DAY, spoken
+from nerf_lightning.messages.console import spoken
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.step_output import StepOutput
 
 log = logging.getLogger(__name__)
+
+
+LONG = 3 * 3600.0  # Seconds: who trains longer is told how not to.
 
 
 class TrainingProgress(ProgressBar):
@@ -67,7 +70,7 @@ class TrainingProgress(ProgressBar):
         # Negative after a restart, which counts anew.
         rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
-        self._warn_of_days((pl_module.step.num_steps - step) / per_second)
+        self._warn_of_hours((pl_module.step.num_steps - step) / per_second)
         output: StepOutput = outputs["step"]
         loss, quality = torch.stack([output.losses.sum(), psnr(output.color_errors[-1])]).tolist()
         text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
@@ -82,8 +85,8 @@ class TrainingProgress(ProgressBar):
         self.started += seconds
         self.shown += seconds
 
-    def _warn_of_days(self, left: float) -> None:
-        if left > DAY and not self.warned:
+    def _warn_of_hours(self, left: float) -> None:
+        if left > LONG and not self.warned:
             self.warned = True
             log.warning(
                 "At this speed the training takes another %s. model=auto (fast, or fast_proposal for photographs) "

@@ -88,12 +88,12 @@ def test_a_stopped_process_uses_no_time(monkeypatch):
     assert signal.getsignal(signal.SIGCONT) == former
 
 
-def test_a_training_of_days_says_once_what_takes_minutes(caplog):
+def test_a_training_of_many_hours_says_once_what_takes_minutes(caplog):
     progress = TrainingProgress()
-    progress._warn_of_days(3600.0)
+    progress._warn_of_hours(3600.0)
     assert caplog.text == ""
     for left in (3_265_128.0, 3_265_000.0):
-        progress._warn_of_days(left)
+        progress._warn_of_hours(left)
     assert caplog.text.count("the training takes another 38 days") == 1
     assert "budget.seconds=300 ends it in five" in caplog.text
 
