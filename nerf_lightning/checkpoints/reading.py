@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import pickle
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,12 @@ class Checkpoint:
 
     def _load(self, state: dict[str, Tensor], module: nn.Module, name: str) -> None:
         with reading(self.path, OTHER_MODEL):
-            module.load_state_dict(state)  # keys and shapes, which some parts take from the file
+            try:
+                module.load_state_dict(state)  # keys and shapes, which some parts take from the file
+            except RuntimeError as error:
+                first = re.search(r"size mismatch for [\w.]+|\w+ key\(s\) in state_dict: \"[^\"]+\"", str(error))
+                where = f" ({first[0]})" if first else ""
+                raise InputError(f"{self.path} holds the {name} of another model{where}. {OTHER_MODEL}") from error
             require_like(state, module.state_dict(), name)
 
 

@@ -60,8 +60,10 @@ def require_settings(words: Sequence[str], or_paths: bool) -> None:
 def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
     """Return the arguments with those that are paths gathered into `key=...`.
 
-    A path is what has no `=`, or what is there: the folders of a sweep's jobs are named `0_seed=0`.
+    A path is what has no `=`, or what is there: the folders of a sweep's jobs are named `0_seed=0`. So is `ckpt=PATH`,
+    which other commands take.
     """
+    arguments = arguments if key == "ckpt" else [word.removeprefix("ckpt=") for word in arguments]
     paths = [
         word for word in arguments if not word.startswith(("-", "+", "~")) and ("=" not in word or Path(word).exists())
     ]

@@ -38,8 +38,9 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
     order = sorted(commands, key=lambda name: name != "train")
     found = "" if all(pages) else search(words, list(map(_command, order)), _width())
     if not found and len(words) > 1 and not all(pages) and not re.search(r"[.=]", "".join(words)):
-        told = f"Nothing in the help has all these words: {' '.join(words)}."
-        raise InputError(f"{told} Use fewer, such as nerf help {words[-1]}.")
+        known = (word for word in words if search([word], list(map(_command, order)), _width()))
+        fewer = next((f"Use fewer, such as nerf help {word}." for word in known), "nerf --help lists the commands.")
+        raise InputError(f"Nothing in the help has all these words: {' '.join(words)}. {fewer}")
     return found or "\n\n".join(page or _found(word, order) for word, page in zip(words, pages, strict=True))
 
 

@@ -5,7 +5,6 @@ Everything heavy is imported late: `--help` needs none of it.
 
 import logging
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from nerf_lightning.cli.arguments import named_paths
@@ -19,6 +18,9 @@ log = logging.getLogger(__name__)
 
 def prepared(command: str, arguments: list[str]) -> list[str]:
     """Return a command's arguments with what belongs before them; the user's own come last, and win."""
+    if command in PATHS_ALONE:
+        key = PATHS_ALONE[command]
+        arguments = named_paths(arguments, key, several=key == "runs")
     prepare = PREPARED.get(command)
     return arguments if prepare is None else prepare(arguments)
 
@@ -108,8 +110,7 @@ def _eval_or_without(arguments: list[str], without: list[str], said: str) -> lis
 
 
 def _report(arguments: list[str]) -> list[str]:
-    """Take a path that stands alone for the run, and name the run's own scene where the user names none."""
-    arguments = named_paths(arguments, "run", several=False)
+    """Name the run's own scene where the user names none."""
     given = dict(argument.partition("=")[::2] for argument in arguments)
     if "run" not in given or "scene" in given or given.get("doctor", "").lower() == "false":
         return arguments
@@ -127,8 +128,8 @@ PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
     "eval": _eval,
     "view": _view,
     "export": _export,
-    "table": partial(named_paths, key="runs", several=True),
     "report": _report,
 }
 
-PATHS_ALONE = ("table", "report")  # Commands that take paths without a key
+PATHS_ALONE = {"table": "runs", "report": "run", **dict.fromkeys(("eval", "render", "view", "export"), "ckpt")}
+"""Commands that take paths without a key, and the setting that these are."""

@@ -108,6 +108,12 @@ def explain(error: BaseException, command: str) -> str:
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
         part = where.group(1) if where else "The config"
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", reason)
+        if unknown is not None:
+            return (
+                f"{part}.{unknown[1]} is set, by an experiment or another file, but the chosen {part} has no such "
+                f"setting. Remove it with ~{part}.{unknown[1]}."
+            )
         if isinstance(chain[-1], ModuleNotFoundError):
             return (
                 f"{part} cannot be built: {reason}. Python searches the installed packages and the folders in "

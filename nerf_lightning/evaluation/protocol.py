@@ -152,6 +152,8 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
 
 
 def _said(protocol: Mapping[str, Any], key: str) -> str:
+    if key == "resolution" and isinstance(protocol.get(key), list):
+        return ", ".join(" x ".join(map(str, size)) for size in protocol[key] if isinstance(size, list))[:80]
     return str(protocol[key])[:80] if key in protocol else "not said"
 
 

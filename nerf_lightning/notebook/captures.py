@@ -17,7 +17,7 @@ def read(capture: str | os.PathLike[str] | None = None, *, scene: str = "auto", 
 
     `nl.read("data/fox")` recognizes COLMAP, nerfstudio, instant-ngp, Blender, LLFF and others by their files;
     `nl.read("photographs", scene="photos")` finds the cameras first, and `nl.read(scene="bricks")` generates the
-    embedded scene.
+    built-in scene.
 
     Args:
         capture: the capture's folder, or an .npz file; None for a generated scene.

@@ -54,7 +54,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     [
         ("fog", "\n  * Fog disappears last"),
         ("foggy", "\n  * Fog disappears last"),
-        ("crash", "Training stopped or crashed"),
+        ("crash", "Training stopped, crashed, or was killed"),
         ("ssh", "ssh -L 8080:127.0.0.1:8080 MACHINE"),
         ("compare runs", "nerf table  "),
         ("film", "nerf render  "),

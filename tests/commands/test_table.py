@@ -148,7 +148,7 @@ def test_what_makes_the_pictures_differ_is_told_alone(table, tmp_path):
     other = {"split_hash": "f" * 16, "resolution": [[400, 400]]}
     leave_measured_run(tmp_path / "runs" / "b", protocol=other, origin={"config": "b"})
     result, _ = table()
-    said(result, "(resolution: [[800, 800]] and [[400, 400]])")
+    said(result, "(resolution: 800 x 800 and 400 x 400)")
 
 
 def test_pictures_that_no_setting_tells_apart_are_said_to_be_other_files(table, tmp_path):

@@ -14,7 +14,7 @@ MOST = 20
 
 def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str:
     """Return what all the words, or their beginnings, stand in; empty if there is nothing."""
-    begun = [re.compile(rf"\b{re.escape(word[: max(4, len(word) - 2)])}", re.IGNORECASE) for word in words]
+    begun = [re.compile(rf"\b{re.escape(_stem(word))}", re.IGNORECASE) for word in words]
     # Their help begins with `nerf NAME: what it does.`
     texts = {f"nerf {each.name}": each.template.partition(": ")[2].partition("\n\n")[0] for each in commands}
     for command in commands:
@@ -26,6 +26,18 @@ def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str
     return "\n".join([*_symptoms(begun, width), *(row(key, brief(text), width) for key, text in found[:MOST])])
 
 
+def _stem(word: str) -> str:
+    """Return how words of one family begin.
+
+    >>> [_stem(word) for word in ("crashed", "films", "latex")]
+    ['crash', 'film', 'latex']
+    """
+    if re.search(r"[.=]", word):  # the name of a setting
+        return word
+    word = word.removesuffix("s") if len(word) > 4 else word
+    return word[: max(5, len(word) - 2)]
+
+
 def _symptoms(begun: list[re.Pattern[str]], width: int) -> Iterator[str]:
     """Yield what the page of symptoms says below its headings, as far as it fits."""
     page = (conf_folder().parent / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
@@ -34,4 +46,5 @@ def _symptoms(begun: list[re.Pattern[str]], width: int) -> Iterator[str]:
         heading, *points = (" ".join(part.split()) for part in section.split("\n* "))
         fitting = [point for point in points if all(word.search(f"{heading} {point}") for word in begun)]
         if fitting:
-            yield "\n".join([heading, *map(bullets.fill, fitting), ""])
+            whole = (re.sub("`.*?`", lambda command: command[0].replace(" ", "\xa0"), point) for point in fitting)
+            yield "\n".join([heading, *map(bullets.fill, whole), ""]).replace("\xa0", " ")

@@ -1,4 +1,4 @@
-"""The embedded scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
+"""The built-in scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -46,7 +46,7 @@ PLASTIC = 1.32471795724474602596
 
 @dataclass
 class BricksReader(Reader):
-    """Render the embedded scene, with exact depth and normals.
+    """Render the built-in scene, with exact depth and normals.
 
     Args:
         resolution: width and height of every image in pixels.

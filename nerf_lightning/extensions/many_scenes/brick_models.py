@@ -29,7 +29,7 @@ HALF = 1.2
 
 @dataclass
 class BrickModelReader(BricksReader):
-    """Render a random model of bricks as the embedded scene is, with exact depth and normals.
+    """Render a random model of bricks as the built-in scene is, with exact depth and normals.
 
     Args:
         variant: which model: 0 is the fire engine; every other number is a different vehicle or tower, with its own

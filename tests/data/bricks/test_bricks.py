@@ -1,4 +1,4 @@
-"""The embedded scene: its solids against closed forms, its pictures against its geometry, its cache."""
+"""The built-in scene: its solids against closed forms, its pictures against its geometry, its cache."""
 
 import hashlib
 import threading

@@ -1,4 +1,4 @@
-"""The embedded scene's surface is known: a mesh of a short run stays close to it."""
+"""The built-in scene's surface is known: a mesh of a short run stays close to it."""
 
 import numpy as np
 import pytest
