@@ -209,7 +209,7 @@ def coverage(evidence: Evidence) -> Check:
         before, after = (scene.view_names[view] for view in azimuth.argsort().roll(-place)[:2].tolist())
         cure = (
             f"Take {math.ceil(widest / STEP)} more photographs between where {before} and {after} were taken, around "
-            f"{at:.0f} degrees on the coverage map."
+            f"{at:.0f} degrees on the coverage map (in the report, and in the doctor's doctor.png)."
         )
         return look(f"{message}, with a gap of {widest:.0f} degrees", cure)
     return ok(message)

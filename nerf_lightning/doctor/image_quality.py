@@ -99,7 +99,7 @@ def exposure(evidence: Evidence) -> Check:
         words.append(f"{evidence.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")
     if odd:
         words.append(f"{evidence.named(odd)} differ in white balance")
-    cure = "Photograph with fixed exposure and white balance; or even them out, or leave these photographs out."
+    cure = "correction=exposure learns these differences; photographs with fixed exposure and white balance are better."
     return look("; ".join(words), cure)
 
 
