@@ -48,17 +48,6 @@ def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
         said(nerf(*command, f"paths.output_dir={tmp_path}/file/run"), "cannot be written", "paths.output_dir=DIR")
 
 
-def test_a_missing_capture(nerf, tmp_path):
-    said(nerf("train", "scene=blender", f"scene.root={tmp_path}/none", f"paths.output_dir={tmp_path}/run"), "none")
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_gpu_that_is_not_there(nerf):
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a GPU")
-    said(nerf("train", "trainer=gpu"), "torch sees no CUDA device", "trainer=cpu")
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -66,7 +55,6 @@ def test_a_gpu_that_is_not_there(nerf):
         ("scene.near=close", "scene.near=close is not valid: it must be a number"),
         ("trainer.precision=16-mixed", "it must be auto, 32-true, tf32, bf16-mixed"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
-        ("path.num_frames=0", "path.num_frames is 0"),
         ("path=photographs path.views=-1", "path.views=-1 is not valid: it must be a list or null"),
         ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
@@ -77,17 +65,13 @@ def test_a_gpu_that_is_not_there(nerf):
         ("scene._target_=5", "See nerf train --help"),
         ("trainer.num_threads=0", "trainer.num_threads=0: give a number from 1 to 4096"),
         ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
-        ("init_from=[1]", "init_from=[1] is not valid: it must be a path"),
         ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 is not valid: it must be a Field, chosen by"),
         ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Fix optimizer.*"),
         ("callbacks.monitor=5", "callbacks.monitor=5 is not a callback. To remove one, add ~callbacks.monitor."),
         ("budget=null", "budget=None is not valid: it holds settings, such as budget.seconds=VALUE"),
-        ("final=5", "final=5 is not valid: it holds settings, such as final.evaluate=VALUE"),
         ("data.batch_rays=1000000000000", "data.batch_rays=1000000000000, which takes"),
-        ("scene.aabb_half=inf", "scene.aabb_half is inf, but half the side of a box must be above 0"),
         ("scene.far=1e300", "scene.far is 1e+300, but rays need 0 <= near < far <= 1e+09"),
         ("field=null", "A group was given something other than the name of one of its options"),
-        ("model=5", "A group was given something other than the name of one of its options"),
     ],
 )
 def test_a_bad_setting_is_named_before_a_folder_is_taken(train, tmp_path, override, words):
@@ -167,29 +151,12 @@ def test_a_part_that_is_not_found_says_where_python_looks_and_a_misnamed_one_of_
     said(nerf(*given, "loss._target_=nerf_lightning.nerf.losses.mse.L1"), "has no such class or function")
 
 
-def train_on(nerf, tmp_path, *settings):
-    where = (f"scene.root={tmp_path}/capture", f"scene.cache_dir={tmp_path}/cache", f"paths.output_dir={tmp_path}/run")
-    return nerf("train", "scene=colmap", *where, *FAST, *settings)
-
-
-def refused(result, tmp_path, *parts):
-    said(result, *parts)
-    assert not (tmp_path / "run").exists()
-    assert not list((tmp_path / "cache").glob("*.pixels")) if (tmp_path / "cache").exists() else True
-
-
 def test_a_broken_capture_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):
     """That each broken file of each format is named with its cure: tests/data/readers/test_malformed.py."""
     path = write_colmap(tmp_path / "capture", Known()) / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes()[:100])
-    words = ("images.bin cannot be read", "has 100 bytes", "nerf poses images=DIR")
-    refused(train_on(nerf, tmp_path), tmp_path, *words)
-
-
-def test_bad_settings_are_one_paragraph(nerf, tmp_path):
-    write_colmap(tmp_path / "capture", Known())
-    spaces = ("space", "auto", "bounded", "contracted")
-    for setting, parts in (
-        ("space=unbounded", spaces), ("root=123", ("root",)), ("downscale=1.5", ("downscale", "1.5")),
-    ):  # fmt: skip
-        refused(train_on(nerf, tmp_path, f"scene.{setting}"), tmp_path, *parts)
+    where = (f"scene.root={tmp_path}/capture", f"scene.cache_dir={tmp_path}/cache", f"paths.output_dir={tmp_path}/run")
+    result = nerf("train", "scene=colmap", *where, *FAST)
+    said(result, "images.bin cannot be read", "has 100 bytes", "nerf poses images=DIR")
+    assert not (tmp_path / "run").exists()
+    assert not list(tmp_path.rglob("*.pixels"))

@@ -73,14 +73,6 @@ def test_opencv_axes_are_printed_with_their_cure_in_the_width_of_the_terminal(co
     assert "wrong; 10 views examined" in result.out
 
 
-def test_photographs_without_pose_reach_the_doctor(corner, doctor):
-    folder = corner()
-    Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / "spare.png")
-    _, checks = doctor(folder)
-    assert "1 of 11" in checks["photographs without pose"]["message"]
-    assert "spare.png" in checks["photographs without pose"]["message"]
-
-
 def test_a_capture_that_cannot_be_read_ends_with_one_paragraph(doctor, tmp_path):
     result, _ = doctor(tmp_path / "nowhere")
     assert result.code == 2

@@ -50,7 +50,7 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, f
     said(nerf("export", f"ckpt={last}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR")
 
 
-def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs(nerf, last, capture, tmp_path):
+def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs_where_there_are_any(nerf, last, capture, tmp_path):
     searched = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
     given = ("export", searched, f"ckpt={last}", "what=mean_colors", f"paths.output_dir={tmp_path}")
     assert nerf(*given).code == 0
@@ -59,20 +59,12 @@ def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs(nerf, last, 
     assert found
     for name, (photographed, _) in found.items():
         np.testing.assert_allclose(photographed, images[int(name)].mean(axis=(0, 1)), atol=3e-3)
-    assert nerf(*given, "photographs=false").code == 0
-    assert json.loads((tmp_path / "mean_colors.json").read_text()) == {}
-
-
-def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
-    given = ("what=page", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2")
-    gone = ("scene=npz", f"scene.path={tmp_path}/gone.npz", f"paths.output_dir={tmp_path}")
-    result = nerf("export", f"ckpt={last}", *given, *gone)
-    if result.code:
-        said(result, "There is no surface to put splats on")
-        return
-    assert "and are left out: The file" in result.err
-    assert "fitted to the field" in result.out
-    assert 'class="without"' in (tmp_path / "page.html").read_text()
+    for without, told in (("photographs=false", ""), (f"scene.path={tmp_path}/gone.npz", "and are left out: The file")):
+        (tmp_path / "mean_colors.json").unlink()
+        result = nerf(*given, without)
+        assert result.code == 0, result.err
+        assert told in result.err
+        assert json.loads((tmp_path / "mean_colors.json").read_text()) == {}
 
 
 def test_bad_input_is_one_paragraph(nerf, last, tmp_path):

@@ -61,7 +61,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
 
 @pytest.mark.slow
 def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
-    long = ("trainer.max_steps=1000000", "budget.seconds=2", "scheduler.cooldown=1.0")
+    long = ("trainer.max_steps=1000000", "budget.seconds=1", "scheduler.cooldown=1.0")
     code, output = finished(start(*arguments(capture, tmp_path / "run", *long)))
     assert code == 0, output
     content = saved(tmp_path / "run")
@@ -71,8 +71,8 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     assert rate["lr"] / rate["base_lr"] < 0.02 + 3 / content["global_step"]
     used = [state["used"] for state in content["callbacks"].values() if "used" in state]
     assert used
-    assert used[0] >= 1.5
-    assert "2 s (budget.seconds) of steps of" in output
+    assert used[0] >= 0.75
+    assert "1 s (budget.seconds) of steps of" in output
     assert f"{content['global_step']} steps in " in output
 
 
@@ -97,19 +97,3 @@ def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overri
     assert "Traceback" not in result.err
     assert all(part in complaint[0] for part in parts), complaint
     assert not folder.exists()
-
-
-@pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
-def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp_path, model):
-    """The order of the levels is part of what it keeps."""
-    small = [x for x in FAST_PATH if not x.startswith(("model", "data.sample_budget"))]
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *[x for x in QUIET if x not in FAST_PATH], *small,
-        f"model={model}", "trainer.max_steps=2", "final.evaluate=false", "final.video=false",
-        f"paths.output_dir={tmp_path}/run",
-    )  # fmt: skip
-    assert result.code == 0, result.err
-    last = tmp_path / "run/checkpoints/last.ckpt"
-    result = nerf("render", f"ckpt={last}", "path.num_frames=2", f"paths.output_dir={tmp_path}/film")
-    assert result.code == 0, result.err
-    assert (tmp_path / "film/video.mp4").is_file()

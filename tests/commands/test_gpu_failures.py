@@ -12,8 +12,9 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize(("failing_step", "saved_step"), [(3, None), (8, 5)])
-@pytest.mark.parametrize("kind", FAILURES)
+@pytest.mark.parametrize(
+    ("kind", "failing_step", "saved_step"), [(RuntimeError, 3, None), (torch.AcceleratorError, 8, 5)]
+)
 def test_a_gpu_that_fails_in_a_step_ends_with_the_way_to_go_on(
     train, tmp_path, monkeypatch, kind, failing_step, saved_step
 ):

@@ -145,10 +145,9 @@ def test_settings_of_the_page_that_cannot_be_are_refused_at_once():
     for share in (0.0, 1.0, -1.0):
         with pytest.raises(InputError, match="give a share of the time between 0 and 1"):
             LiveView(share=share)
-    with pytest.raises(InputError, match="cannot listen there"):
-        LiveView(host="192.0.2.1")
-    with pytest.raises(InputError, match="port=0"):
-        LiveView(port=0)
+    for port in (0, 65_536):
+        with pytest.raises(InputError, match=f"port={port}: give a number"):
+            LiveView(port=port)
     with pytest.raises(InputError, match="not the name of a machine"):
         LiveView(hosts=["a b"])
 

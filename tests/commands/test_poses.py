@@ -147,23 +147,6 @@ def test_of_photographs_of_two_places_the_larger_part_is_taken_and_the_other_nam
     assert left == ["0"]
 
 
-@pytest.mark.slow
-def test_photographs_that_were_turned_are_put_upright_and_found(poses, tmp_path):
-    write_corner(tmp_path / "given", count=4)
-    for number in (1, 2):
-        path = tmp_path / "given" / f"view {number}.png"
-        with Image.open(path) as upright:
-            turned = upright.transpose(Image.Transpose.ROTATE_90)
-        exif = Image.Exif()
-        exif[0x0112] = 6
-        turned.save(path, exif=exif)
-    result = poses(f"images={tmp_path / 'given'}", "num_features=600")
-    assert result.code == 0, result.err
-    assert "registered          4 of 4 photographs (one camera" in result.out
-    with Image.open(tmp_path / "found" / "images" / "view 1.png") as written:
-        assert written.size == (320, 240)
-
-
 def test_photographs_of_several_sizes_or_without_anything_in_common(poses, photographs, tmp_path):
     refused(poses(f"images={photographs}"), tmp_path, "No camera could be placed: the 3 pictures", "overlap by two")
     Image.new("RGB", (80, 80)).save(photographs / "odd.png")

@@ -115,7 +115,7 @@ def scontrol(tmp_path, monkeypatch):
 def begin(capture, root, *more, **options):
     return start(
         "train", "scene=npz", f"scene.path={capture}", *FAST, "logger=none", "trainer.max_steps=150",
-        "final.video=false", f"paths.root_dir={root}", *more, **options,
+        "final.evaluate=false", "final.video=false", f"paths.root_dir={root}", *more, **options,
     )  # fmt: skip
 
 

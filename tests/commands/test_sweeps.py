@@ -48,7 +48,10 @@ def wait_for_step(folder, step, process):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "launcher",
-    ["parallel", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("basic", "joblib", "slurm_here"))],
+    [
+        *("basic", pytest.param("parallel", marks=pytest.mark.minutes)),
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("joblib", "slurm_here")),
+    ],
 )
 def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, launcher):
     sweep = arguments(capture, tmp_path, f"hydra/launcher={launcher}", "seed=0,1")

@@ -144,14 +144,6 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_pa
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
 
 
-def test_an_epoch_is_every_training_ray_once(train, tmp_path):
-    once = ("trainer.max_epochs=1", "data.batch_rays=100", "trainer.max_steps=1000")
-    result = train(*once, "final.video=false", "final.evaluate=false", "logger=none")
-    assert result.code == 0, result.err
-    steps = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"]
-    assert steps == 3 + -(-8 * 256 // 100)  # after the crop
-
-
 # Every experiment is composed and built elsewhere; these take the longest to end.
 ARTICLES = ("lego_article", "lego_article_100")
 

@@ -100,15 +100,6 @@ def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_
     assert {parameter.dtype for parameter in model.parameters()} == {torch.float32}
 
 
-@pytest.mark.slow
-def test_bfloat16_trains_and_evaluates(train, tmp_path):
-    every = ("callbacks.validation_pictures.every_steps=3", "trainer.max_steps=3", "path.width=8")
-    result = train("trainer.precision=bf16-mixed", *every)
-    assert result.code == 0, result.err
-    weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    assert all(value.dtype == torch.float32 for value in weights.values() if value.is_floating_point())
-
-
 def test_what_this_machine_lacks_is_refused_with_a_cure(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)

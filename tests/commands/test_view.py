@@ -126,8 +126,7 @@ def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
     )
 
 
-def test_a_missing_checkpoint_and_a_port_that_is_none_are_said(finished_run, nerf, tmp_path):
-    said(nerf("view", "ckpt=nowhere.ckpt"), "There is no checkpoint at nowhere.ckpt")
+def test_a_place_to_listen_that_is_none_is_said(finished_run, nerf, tmp_path):
     checkpoint = finished_run / "checkpoints" / "last.ckpt"
     arguments = [f"ckpt={checkpoint}", f"paths.output_dir={tmp_path}", "photographs=false"]
     said(nerf("view", *arguments, "port=0"), "port=0: give a number from 1 to 65535")

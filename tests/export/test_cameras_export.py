@@ -50,7 +50,7 @@ def test_round_trip_through_both_formats(tmp_path, camera):
     known = known_turned(camera=camera, params=LENSES[camera])
     scene = read("colmap", write_colmap(tmp_path / "made", known))
     folder = tmp_path / "exported"
-    CamerasExport(images="images").export(solid(ball()), scene_record(scene), folder, 4096)
+    CamerasExport(images="images").export(solid(ball()), scene_record(scene), folder, 65_536)
     write_pictures(folder / "images", known.names, known.size)
     back = read("colmap", folder)
     assert back.cameras.lens_model == scene.cameras.lens_model
@@ -66,7 +66,7 @@ def test_round_trip_through_both_formats(tmp_path, camera):
 def test_a_forward_facing_capture_has_its_cameras_in_the_world(tmp_path):
     known = Known(c2w=wall())
     scene = read("llff", write_llff(tmp_path / "made", known), space="ndc")
-    CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 4096)
+    CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 65_536)
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     poses = {frame["file_path"]: np.array(frame["transform_matrix"])[:3] for frame in frames}
     for name, pose in zip(known.names, known.c2w, strict=True):
@@ -76,7 +76,7 @@ def test_a_forward_facing_capture_has_its_cameras_in_the_world(tmp_path):
 def test_a_lens_that_colmap_lacks_goes_into_the_json_alone(tmp_path, caplog):
     scene = read("transforms", write_transforms(tmp_path / "made", Known(c2w=ring()), k1=0.05, k3=0.01))
     with caplog.at_level(logging.WARNING):
-        written = CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 4096)
+        written = CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 65_536)
     assert "k3 or k4, which COLMAP's model OPENCV lacks" in caplog.text
     assert [path.name for path in written] == ["transforms.json"]
     assert not (tmp_path / "out" / "sparse").exists()

@@ -30,7 +30,7 @@ def page(request, tmp_path_factory):
     what, scene = PageExport(400, 0.5, request.param, photographs=3, max_views=0), all_around()
     what.beside = beside(scene)
     with torch.no_grad():
-        return what.export(shiny_model(), record_of(scene), tmp_path_factory.mktemp("page"), 4096)[0]
+        return what.export(shiny_model(), record_of(scene), tmp_path_factory.mktemp("page"), 65_536)[0]
 
 
 def test_it_shows_what_the_rasterizer_draws_and_asks_for_nothing(page):
@@ -112,7 +112,7 @@ def moving(tmp_path_factory):
     orbit = page_path(Orbit(120, fps=12), record, tmp_path_factory.mktemp("run"))
     what.beside = replace(beside(scene), keyframes=orbit)
     with torch.no_grad():
-        return what.export(shiny_model(), record, tmp_path_factory.mktemp("moving"), 4096)[0], record
+        return what.export(shiny_model(), record, tmp_path_factory.mktemp("moving"), 65_536)[0], record
 
 
 def seen_by(path, page, record, second: float, found: np.ndarray) -> np.ndarray:
@@ -171,7 +171,7 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
         assert run("return document.getElementById('length').value") == "10.0 s"
         assert driver.get_log("browser") == []
     # And filmed by the program itself.
-    shots = make_shots([Subject(shiny_model(), record, "white")], replace_frames(path, 3), 4096)
+    shots = make_shots([Subject(shiny_model(), record, "white")], replace_frames(path, 3), 65_536)
     assert float(shots[0].picture(1).opacity.max()) > 0.9
 
 

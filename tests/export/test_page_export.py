@@ -21,7 +21,7 @@ def exported(folder, scene=None, facts=(), **settings):
     what = PageExport(**({"num_splats": 300, "seconds": 0.0, "photographs": 4, "max_views": 1} | settings))
     what.beside = beside(scene, *facts)
     with torch.no_grad():
-        return what.export(shiny_model(), record_of(scene), folder, 4096)[0]
+        return what.export(shiny_model(), record_of(scene), folder, 65_536)[0]
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_texts_of_a_stranger_stay_texts(page, tmp_path):
 def test_without_photographs_the_cameras_are_still_there(tmp_path):
     what = PageExport(300, 0.0, photographs=3)
     with torch.no_grad():
-        (target,) = what.export(shiny_model(), record_of(all_around()), tmp_path, 4096)
+        (target,) = what.export(shiny_model(), record_of(all_around()), tmp_path, 65_536)
     text = target.read_text()
     assert text.count('class="without"') == 3
     assert "dB on 6 test views, with the field" in text
@@ -103,11 +103,11 @@ def test_what_is_no_page_of_ours_is_not_written_over(tmp_path):
     model, record = shiny_model(), record_of(all_around())
     target = tmp_path / "page.html"
     target.write_text("<html>somebody's own</html>")
-    refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html", "would be lost", "Move it away"))
+    refused(PageExport().export, model, record, tmp_path, 65_536, parts=("page.html", "would be lost", "Move it away"))
     assert target.read_text() == "<html>somebody's own</html>"
     target.unlink()
     target.mkdir()
-    refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html is a folder",))
+    refused(PageExport().export, model, record, tmp_path, 65_536, parts=("page.html is a folder",))
 
 
 def test_a_page_is_known_by_its_beginning(page, tmp_path):

@@ -59,7 +59,7 @@ def exported(folder, **settings):
     what = PageExport(300, 0.0, photographs=2, max_views=0, **settings)
     what.beside = beside(all_around())
     with torch.no_grad():
-        what.export(shiny_model(), record_of(all_around()), folder, 4096)
+        what.export(shiny_model(), record_of(all_around()), folder, 65_536)
     return read_page(folder / "page.html")[0]
 
 

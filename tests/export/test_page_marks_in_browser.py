@@ -37,7 +37,7 @@ def page(tmp_path_factory):
     what.beside = beside(scene)
     to_user = similarity(torch.eye(3), torch.tensor([5.0, 0.0, 0.0]), 3.0)
     with torch.no_grad():
-        return what.export(shiny_model(), record_of(scene, to_user=to_user, metres_per_unit=0.01), folder, 4096)[0]
+        return what.export(shiny_model(), record_of(scene, to_user=to_user, metres_per_unit=0.01), folder, 65_536)[0]
 
 
 def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tmp_path):

@@ -33,14 +33,7 @@ SEARCHED = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'
 SMALL_GRID = ["encoder.first.log2_table_size=10", "encoder.second.num_frequencies=3"]
 ADDED = {
     "an encoder that joins two": ["model=fast_small", "encoder=joined", *SMALL_GRID],
-    "an encoder that joins two, in an MLP": [
-        "model=nerf_tiny", "encoder=joined", "field=ngp", *SMALL_GRID, "field.width=16"
-    ],
     "a packed sampler without a grid": ["model=fast_small", "sampler@model.levels.fine.sampler=box"],
-    "a packed sampler without a grid, over an MLP": [
-        "model=nerf_occupancy", "sampler@model.levels.fine.sampler=box", "field=nerf_mlp_tiny",
-        "encoder=frequency_small",
-    ],
     "a code for each photograph": ["model=nerf_tiny", "field=nerf_mlp_with_codes"],
     "an encoder with a penalty": ["model=fast_small", "encoder=kplanes"],
     "a structural loss beside the squared error": ["model=nerf_tiny", "loss=mse_dssim", "field.width=16"],

@@ -13,18 +13,19 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import pytest
 from _pytest import runner
-from support import fork_server
+from support import fork_server, type_checks
 from support.large_frame import in_large_frame
 
+# Here: the conftest.py of commands, and that of extensions, import our package before anything is configured.
+type_checks.install()
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
 
 def pytest_configure(config):
     """Prepare what the tests import, but for a process that only hands them to workers."""
     if hasattr(config, "workerinput") or config.getoption("dist", "no") == "no":
-        from support import quick_composition, type_checks
+        from support import quick_composition
 
-        type_checks.install()
         quick_composition.install()
 
 

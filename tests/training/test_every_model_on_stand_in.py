@@ -77,7 +77,9 @@ def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
     assert there.waited == waits
 
 
-@pytest.mark.parametrize("model", [marked(model) for model in MODELS])
+@pytest.mark.parametrize(
+    "model", [pytest.param(name, marks=() if name in SINGLE else pytest.mark.minutes) for name in MODELS]
+)
 def test_every_model_trains_and_renders_on_mps(model):
     with StandInDevice("mps") as there:
         run = run_on(there, model, "32-true")

@@ -22,8 +22,6 @@ BUDGETS = {
     "fast,32-true": (97, 25, 42, 2),
     "fast_proposal,32-true": (152, 27, 41, 2),
 }
-QUICK = list(BUDGETS)[:1]
-CASES = [pytest.param(case, marks=() if case in QUICK else pytest.mark.minutes) for case in BUDGETS]
 # How far losses may be apart after up to two steps: bfloat16 has 8 bits, and Adam's first steps follow signs.
 TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}
 
@@ -37,7 +35,8 @@ def measured(case):
     return json.loads(result.stdout)[case]
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.minutes
+@pytest.mark.parametrize("case", BUDGETS)
 def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
     found, precision = measured(case), case.split(",")[1]
     assert found["step"]["kernels"] > 0

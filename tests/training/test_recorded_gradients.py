@@ -53,12 +53,12 @@ def assert_same(run, other):
 
 
 def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_for_each_size_of_batches():
-    sizes = [48] * 10
+    sizes = [48] * 6
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
     assert list(run.training._recorded.recordings) == [(48, (None,))]
     assert run.training.model.statistics()["train/dropped_samples"] == 0
-    assert run.all_losses().unique().numel() == 10
+    assert run.all_losses().unique().numel() == 6
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
@@ -102,8 +102,8 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
     ],
 )
 def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
-    run = trained([48] * 8, True, model, *changes)
-    assert_same(run, trained([48] * 8, False, model, *changes))
+    run = trained([48] * 6, True, model, *changes)
+    assert_same(run, trained([48] * 6, False, model, *changes))
     assert len(run.training._recorded.recordings) == variants
 
 

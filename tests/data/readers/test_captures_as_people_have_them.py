@@ -208,9 +208,8 @@ def test_a_json_by_another_name_and_two_captures_are_refused_with_what_to_type(t
         read(tmp_path / "c")
 
 
-@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+@pytest.mark.parametrize(("write", "folder"), [(write_colmap, "images/masks"), (write_transforms, "masks")])
 @pytest.mark.parametrize("name", ["{}.png.png", "{}_mask.png", "{}.mask.png", "images/{}.jpg", "{}.PNG"])
-@pytest.mark.parametrize("folder", ["masks", "images/masks"])
 def test_masks_are_found_by_their_photographs_names(tmp_path, plain, write, name, folder):
     root = write(tmp_path / "c", KNOWN)
     for view in ALL:
@@ -324,9 +323,13 @@ def test_instant_ngps_lens_counts_in_files_for_training_and_test(tmp_path):
     assert cameras.center[4].tolist() == [9.0, 5.0]
 
 
-@pytest.mark.parametrize("orientation", [0, 1, 3, 6, 8, 9])
-@pytest.mark.parametrize("write", [write_colmap, write_transforms, write_llff])
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("write", "orientation", "turned"),
+    [
+        *((write_transforms, orientation, turned) for orientation in (0, 1, 3, 6, 8, 9) for turned in (False, True)),
+        *((write, 6, turned) for write in (write_colmap, write_llff) for turned in (False, True)),
+    ],
+)
 def test_the_cameras_size_tells_how_a_photograph_lies(tmp_path, plain, caplog, orientation, write, turned):
     quarter = {6: 1, 8: -1}.get(orientation, 0) if turned else 0
     root = write(tmp_path / "c", KNOWN)

@@ -56,7 +56,6 @@ MODELS = {
 CASES = [
     *((model, "nerf_mlp", "frequency", "frequency") for model in MODELS),
     *((model, "ngp", "hash_grid", "spherical_harmonics") for model in MODELS),
-    ("coarse and fine", "ngp", "frequency", "frequency"),
     ("occupancy", "ngp", "frequency", "frequency"),
 ]
 
