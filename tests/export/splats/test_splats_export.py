@@ -12,11 +12,7 @@ from omegaconf import OmegaConf
 from support.command_fixtures import *  # noqa: F403
 from support.configs import composed
 from support.known_fields import ball, photographed_ball, solid
-<<<<<<< HEAD
 from support.planted import in_config, write_checkpoint
-from support.running import said
-=======
->>>>>>> t-merge
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import read_checkpoint, scene_record
