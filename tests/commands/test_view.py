@@ -139,7 +139,7 @@ def folder_of_page(monkeypatch):
     """Where the page would write; it is not opened."""
     folders = []
 
-    def opened(queue, photographs, folder, *where):
+    def opened(queue, photographs, folder, *where, **options):
         folders.append(folder)
         raise KeyboardInterrupt
 
