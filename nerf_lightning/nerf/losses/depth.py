@@ -31,7 +31,7 @@ class DepthLoss(Loss):
 
     needs_weights = True
 
-    def __init__(self, every: int = 8, fade: float = 0.1):
+    def __init__(self, every: int = 8, fade: float = 0.001):
         super().__init__()
         require_ranges({"every": every, "fade": fade}, RANGES)
         self.depth_every, self.fade = every, float(fade)
