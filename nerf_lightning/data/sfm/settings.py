@@ -32,7 +32,7 @@ class SfmSettings:
         camera_model: COLMAP's name of the lens model; panoramas have one of their own.
         panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
             as wide as high.
-        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 3072, of more than 80 2048,
+        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 2048,
             and other ways where photographs are left out (`attempts`).
         max_image_size: the longer side in pixels to which photographs are shrunk for finding features.
         num_threads: None uses every core. Two runs are identical only with one thread.
@@ -86,14 +86,14 @@ def attempts(settings: SfmSettings, count: int) -> list[Attempt]:
     """Return what is tried for `count` photographs, one after the other while photographs are left out.
 
     >>> [str(attempt) for attempt in attempts(SfmSettings(), 50)][:2]
-    ['3072 round features', 'all cameras placed at once']
+    ['2048 round features', 'all cameras placed at once']
     """
     if settings.num_features != "auto":
         return [Attempt(settings.num_features)]
     if count <= FEW:
         features = [(8192, True), (8192, False)]
     elif count <= SOME:
-        features = [(3072, False), (8192, True)]
+        features = [(2048, False), (8192, True)]
     else:  # more would take hours
         features = [(2048, False)]
     return [Attempt(number, affine, mapper) for number, affine in features for mapper in MAPPERS]

@@ -96,7 +96,7 @@ def test_a_number_of_features_that_is_typed_is_all_that_is_tried(find):
     assert model.apart == ("4.jpg", "5.jpg", "6.jpg")
 
 
-@pytest.mark.parametrize(("count", "features", "tries"), [(16, 8192, 4), (50, 3072, 4), (300, 2048, 2)])
+@pytest.mark.parametrize(("count", "features", "tries"), [(16, 8192, 4), (50, 2048, 4), (300, 2048, 2)])
 def test_many_photographs_begin_with_fewer_features(count, features, tries):
     tried = attempts(SfmSettings(), count)
     assert (tried[0].num_features, len(tried)) == (features, tries)
