@@ -1,4 +1,4 @@
-"""Which classes a stranger's checkpoint may name: parts of models and corrections, from our own rooms, that follow a contract.
+"""Which classes a stranger's checkpoint may name: parts of models and corrections of ours that follow a contract.
 
 A person adds modules of their own with `trust=`; no file can.
 """

@@ -32,8 +32,8 @@ class SfmSettings:
         camera_model: COLMAP's name of the lens model; panoramas have one of their own.
         panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
             as wide as high.
-        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 2048,
-            and other ways where photographs are left out (`attempts`).
+        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 2048, and other ways where
+            photographs are left out (`attempts`).
         max_image_size: the longer side in pixels to which photographs are shrunk for finding features.
         num_threads: None uses every core. Two runs are identical only with one thread.
         seed: of the random numbers.

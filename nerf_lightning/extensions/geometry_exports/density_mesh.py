@@ -30,15 +30,20 @@ log = logging.getLogger(__name__)
 
 
 def mesh_of_density(
-    model: Model, record: SceneRecord, lattice: Lattice, threshold: float | None, tile_points: int, report: Report
+    model: Model,
+    record: SceneRecord,
+    lattice: Lattice,
+    threshold: float | None,
+    closed: bool,
+    tile_points: int,
+    report: Report,
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
     """Return vertices (scene frame) and faces of the surface where the density is `threshold` per scene unit.
 
-    Without a threshold, that is where rendering sees it (`surface_level`).
+    Without a threshold, that is where rendering sees it (`surface_level`). `closed`: also at the sides of the box.
     """
     density = sample_density(model, lattice, tile_points, report)
-    if record.space == "bounded":
-        # Nothing lies outside of its box: the surface is closed there.
+    if closed or record.space == "bounded":  # Of a bounded scene, nothing lies outside.
         for axis in range(3):
             sides = np.moveaxis(density, axis, 0)
             sides[0] = sides[-1] = 0.0
@@ -87,17 +92,36 @@ def without_floaters(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], least_share: float
 ) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"], int]:
     """Return the connected parts that have at least this share of the largest one's faces, and how many have not."""
-    size, edges = len(vertices), np.concatenate([faces[:, :2], faces[:, 1:]])
-    links = coo_array((np.ones(len(edges), bool), edges.T), shape=(size, size))
-    _, part_of_vertex = connected_components(links, directed=False)
-    part = part_of_vertex[faces[:, 0]]
+    part = _part_of_face(len(vertices), faces)
     num_faces = np.bincount(part)
     large = num_faces >= least_share * num_faces.max()
-    faces = faces[large[part]]
+    return *_only(vertices, faces[large[part]]), int(((num_faces > 0) & ~large).sum())
+
+
+def without_cavities(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
+) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"]]:
+    """Return the connected parts of a closed mesh that hold matter: the surface of a cavity has a negative volume."""
+    a, b, c = vertices[faces.T].astype(np.float64)
+    volumes = (a * np.cross(b, c)).sum(axis=1) / 6.0
+    part = _part_of_face(len(vertices), faces)
+    return _only(vertices, faces[(np.bincount(part, volumes) > 0)[part]])
+
+
+def _part_of_face(size: int, faces: Int[ndarray, "faces 3"]) -> Int[ndarray, "faces"]:
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = coo_array((np.ones(len(edges), bool), edges.T), shape=(size, size))
+    found: Int[ndarray, "faces"] = connected_components(links, directed=False)[1][faces[:, 0]]
+    return found
+
+
+def _only(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
+) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "faces 3"]]:
     used = np.unique(faces)
-    place = np.full(size, -1, np.int32)
+    place = np.full(len(vertices), -1, np.int32)
     place[used] = np.arange(len(used))
-    return vertices[used], place[faces], int(((num_faces > 0) & ~large).sum())
+    return vertices[used], place[faces]
 
 
 VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.

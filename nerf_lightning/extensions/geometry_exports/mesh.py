@@ -14,13 +14,19 @@ from torch import Tensor
 from nerf_lightning.export.base import Export, Report, refuse_ndc, require_free, require_setting
 from nerf_lightning.extensions.geometry_exports import density_mesh, fused_mesh
 from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution
-from nerf_lightning.extensions.geometry_exports.density_mesh import mesh_of_density, seen_faces, without_floaters
+from nerf_lightning.extensions.geometry_exports.density_mesh import (
+    mesh_of_density,
+    seen_faces,
+    without_cavities,
+    without_floaters,
+)
 from nerf_lightning.extensions.geometry_exports.fused_mesh import mesh_of_depth
 from nerf_lightning.extensions.geometry_exports.mesh_files import (
     GltfFrame,
     MeshFormat,
     require_library,
     save_mesh,
+    save_solid,
     save_textured_mesh,
 )
 from nerf_lightning.extensions.geometry_exports.surface import SeenFrom, surface_colors
@@ -34,7 +40,7 @@ from nerf_lightning.extensions.geometry_exports.texture import (
 )
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user, unit_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
@@ -43,6 +49,7 @@ BYTES_PER_POINT = {"density": density_mesh.BYTES_PER_POINT, "tsdf": fused_mesh.B
 # A guess at how the time is shared; the bar corrects itself.
 COSTS = {"density": {"density": 6.0, "surface": 2.0, "views": 6.0}, "tsdf": {"depth": 12.0, "surface": 2.0}}
 COLORING = {False: {"colors": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
+UNKNOWN = 100.0  # Millimeters: the longest side of a print whose size is not known.
 REACH = 2.0  # In cells: so far the surface may be off to each side.
 # Most faces of a mesh with a texture, where nobody says how many: the charts of more take minutes.
 TEXTURED_FACES = 60_000
@@ -52,7 +59,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MeshExport(Export):
-    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a color per vertex or a texture.
+    """Write `mesh.ply` (or .obj, .glb, .stl) of what lies in the scene's box, with a color per vertex or a texture.
 
     Args:
         resolution: cells along the longest side of the box.
@@ -70,8 +77,9 @@ class MeshExport(Export):
             Needs `pip install 'nerf-lightning[texture]'`.
         texture_size: texels along each side of the texture.
         format: the file format. PLY and OBJ use the capture's frame; GLB is one file for browsers, whose root node
-            makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. None: PLY, or GLB with a
-            texture; a textured OBJ comes with an MTL and a PNG.
+            makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. STL is for printing in
+            3D: a closed mesh without cavities and colors, z up, in millimeters. None: PLY, or GLB with a texture; a
+            textured OBJ comes with an MTL and a PNG.
     """
 
     kernels = (f"{__package__}.tsdf_fusion", f"{__package__}.texels")
@@ -104,8 +112,13 @@ class MeshExport(Export):
             raise InputError(f"what.threshold={self.threshold} belongs to what.surface=density. Leave one of them out.")
         if self.surface == "tsdf" and not self.seen_only:
             raise InputError("what.seen_only=false asks for a closed mesh, which needs what.surface=density.")
-        if self.texture and self.format == "ply":
-            raise InputError("what.format=ply has no texture. Give what.format=glb (one file), or obj (three).")
+        if self.texture and self.format in ("ply", "stl"):
+            raise InputError(
+                f"what.format={self.format} has no texture. Give what.format=glb (one file), or obj (three)."
+            )
+        if self.format == "stl" and self.surface == "tsdf":
+            raise InputError("what.format=stl asks for a closed mesh, which needs what.surface=density.")
+        self.seen_only = self.seen_only and self.format != "stl"
         if self.texture and self.faces is None:
             self.faces = TEXTURED_FACES
         self.format = self.format or ("glb" if self.texture else "ply")
@@ -123,6 +136,8 @@ class MeshExport(Export):
         with StageProgress(COSTS[self.surface] | COLORING[self.texture]) as report:
             vertices, faces = self._surface(model, record, lattice, tile_points, report)
             vertices, faces = self._cleaned(vertices, faces)
+            if self.format == "stl":
+                return save_solid(folder / "mesh.stl", in_millimeters(vertices, record), faces)
             log.info("%d vertices, %d faces", len(vertices), len(faces))
             points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
             reach = REACH * lattice.spacing
@@ -158,7 +173,10 @@ class MeshExport(Export):
     ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
         if self.surface == "tsdf":
             return mesh_of_depth(model, record, lattice, self.truncation, tile_points, report)
-        vertices, faces = mesh_of_density(model, record, lattice, self.threshold, tile_points, report)
+        closed = self.format == "stl"
+        vertices, faces = mesh_of_density(model, record, lattice, self.threshold, closed, tile_points, report)
+        if closed:
+            vertices, faces = without_cavities(vertices, faces)
         if self.seen_only:
             faces = seen_faces(model, record, vertices, faces, tile_points, report)
         return vertices, faces
@@ -174,6 +192,23 @@ class MeshExport(Export):
         decimation = require_library("fast_simplification")
         few, kept = decimation.simplify(vertices, faces, target_count=self.faces)
         return np.asarray(few, np.float32), np.asarray(kept, np.int32)
+
+
+def in_millimeters(vertices: Float[ndarray, "vertices 3"], record: SceneRecord) -> Float[ndarray, "vertices 3"]:
+    """Return vertices of the scene's frame, whose z is up, in millimeters and above z = 0, as printers want them.
+
+    Where the capture's unit is not known, the longest side is made 100 mm long.
+    """
+    scale = 1e3 * unit_of(record.to_user) * (record.metres_per_unit or 0.0)
+    if not scale:
+        scale = UNKNOWN / float(np.ptp(vertices, axis=0).max())
+        log.warning(
+            "The size is not known, so the longest side is %g mm: scale it in the slicer, or train with "
+            "scene.metres_per_unit.",
+            UNKNOWN,
+        )
+    scaled = scale * vertices
+    return scaled - [0.0, 0.0, scaled[:, 2].min()]
 
 
 def vertex_normals(

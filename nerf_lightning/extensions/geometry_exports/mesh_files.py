@@ -11,11 +11,11 @@ from numpy import ndarray
 from PIL import Image
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.messages.errors import require_extra
+from nerf_lightning.messages.errors import InputError, require_extra
 from nerf_lightning.nerf.geometry.frames import y_up
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
-MeshFormat = Literal["ply", "obj", "glb"]
+MeshFormat = Literal["ply", "obj", "glb", "stl"]
 MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points as LAS"}
 """What each extra of this package is needed for."""
 
@@ -66,6 +66,20 @@ def save_mesh(
     content = mesh.export(file_type=form, **settings[form])
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
+    return [path]
+
+
+def save_solid(path: Path, vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]) -> list[Path]:
+    """Write a binary STL for printers, which has neither colors nor units; slicers read millimeters.
+
+    Raises:
+        InputError: the mesh is not closed.
+    """
+    mesh = require_library("trimesh").Trimesh(vertices, faces, process=False)
+    if not mesh.is_watertight:
+        raise InputError("The mesh is not closed, as printing needs it. Give more what.faces, or leave them out.")
+    with whole_file(path) as part:
+        part.write_bytes(mesh.export(file_type="stl"))
     return [path]
 
 

@@ -63,6 +63,24 @@ def test_a_ball_is_a_ball_in_every_format(tmp_path, format):
     assert np.abs(colors - expected)[clear].max() <= 2
 
 
+@pytest.mark.parametrize(("metres", "radius"), [(0.01, RADIUS * 2 * 10.0), (None, 50.0)])
+def test_a_print_is_closed_solid_upright_and_in_millimeters(tmp_path, metres, radius):
+    """A hollow ball that the camera's frame has tipped over, in units half as long as the scene's."""
+
+    def hollow(points):
+        return ball()(points) * (points.norm(dim=-1) > 0.6)
+
+    to_user = similarity(upright_rotation(torch.tensor([0.6, 0.0, 0.8])).mT, torch.tensor([5.0, 6.0, 7.0]), 2.0)
+    mesh = exported(
+        tmp_path, solid(hollow), record(to_user=to_user, metres_per_unit=metres), format="stl", min_share=0.0
+    )
+    mesh.merge_vertices()
+    assert mesh.is_watertight
+    assert mesh.bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
+    assert mesh.extents / 2 == pytest.approx([radius] * 3, rel=0.06)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12)
+
+
 def _glb_tree(path):
     content = path.read_bytes()
     length = int.from_bytes(content[12:16], "little")

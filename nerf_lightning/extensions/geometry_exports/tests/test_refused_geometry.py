@@ -35,6 +35,7 @@ def exported(folder, what, **changes):
         (MeshExport, {"surface": "tsdf", "threshold": 3.0}, "what.threshold=3.0 belongs to what.surface=density"),
         (MeshExport, {"surface": "tsdf", "seen_only": False}, "what.seen_only=false asks for a closed mesh"),
         (MeshExport, {"texture": True, "format": "ply"}, "what.format=ply has no texture"),
+        (MeshExport, {"surface": "tsdf", "format": "stl"}, "what.format=stl asks for a closed mesh"),
         (PointsExport, {"agreement": 9}, "what.agreement=9"),
     ],
 )
