@@ -37,7 +37,7 @@ def test_every_kind_of_export_writes_what_it_says(nerf, last, tmp_path):
 
 def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     given = ("export", f"ckpt={last}", "what=mesh", f"paths.output_dir={tmp_path}")
-    said(nerf(*given, "what.format=stl"), "what.format=stl is not valid", "ply, obj, glb")
+    said(nerf(*given, "what.format=3mf"), "what.format=3mf is not valid", "ply, obj, glb, stl")
     said(nerf(*given, "what.resolution=30000"), "what.resolution=30000", "GB", "would fit")
     empty = nerf(*given, "what.threshold=1e9", "what.resolution=32")
     said(empty, "There is no surface", "range from", "1e+09")
