@@ -52,7 +52,7 @@ $(VENV)/.ready: pyproject.toml constraints/torch.txt
 train: setup ## Train the embedded scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
-test: setup ## Run the tests, but for the exhaustive ones: five to seven minutes on two cores
+test: setup ## Run the tests, but for the exhaustive ones: five to six minutes on two cores
 	@$(PYTEST)
 
 test-all: setup ## Run every test, the exhaustive ones included
