@@ -49,7 +49,7 @@ $(VENV)/.ready: pyproject.toml constraints/torch.txt
 	@$(VENV)/bin/python -m nerf_lightning.config.exporters
 	@touch $@
 
-train: setup ## Train the embedded scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
+train: setup ## Train the built-in scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
 test: setup ## Run the tests, but for the exhaustive ones: five to six minutes on two cores

@@ -36,9 +36,10 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
         return help_on(words[0], words[1:])
     pages = [_in_every_command(word, commands) for word in words]
     order = sorted(commands, key=lambda name: name != "train")
-    found = "" if all(pages) else search(words, list(map(_command, order)), _width())
+    searched = list(map(_command, order))
+    found = "" if all(pages) else search(words, searched, _width())
     if not found and len(words) > 1 and not all(pages) and not re.search(r"[.=]", "".join(words)):
-        known = (word for word in words if search([word], list(map(_command, order)), _width()))
+        known = (word for word in words if search([word], searched, _width()))
         fewer = next((f"Use fewer, such as nerf help {word}." for word in known), "nerf --help lists the commands.")
         raise InputError(f"Nothing in the help has all these words: {' '.join(words)}. {fewer}")
     return found or "\n\n".join(page or _found(word, order) for word, page in zip(words, pages, strict=True))

@@ -10,7 +10,6 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.auth import names_of
-from nerf_lightning.viewer.export_panel import exported_files
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
@@ -35,8 +34,7 @@ def run(config: DictConfig) -> None:
     queue = RenderQueue(renderer)
     where = config.host, config.port, config.max_height, config.viewer.hosts
     photographs = Photographs(record, scene, background)
-    exports = exported_files(beside_checkpoint(opened.checkpoint.path, "export"))
-    page = Page(queue, photographs, folder, *where, exports=exports)
+    page = Page(queue, photographs, folder, *where, exports=beside_checkpoint(opened.checkpoint.path, "export"))
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with

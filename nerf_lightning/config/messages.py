@@ -108,11 +108,12 @@ def explain(error: BaseException, command: str) -> str:
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
         part = where.group(1) if where else "The config"
-        unknown = re.search(r"unexpected keyword argument '(\w+)'", reason)
+        unknown = re.search(r"__init__\(\) got an unexpected keyword argument '(\w+)'", reason)
         if unknown is not None:
+            key = f"{part}.{unknown[1]}"
             return (
-                f"{part}.{unknown[1]} is set, by an experiment or another file, but the chosen {part} has no such "
-                f"setting. Remove it with ~{part}.{unknown[1]}."
+                f"{key} is set, but the chosen {part} has no such setting. Leave it out; where an experiment sets it, "
+                f"remove it with ~{key}."
             )
         if isinstance(chain[-1], ModuleNotFoundError):
             return (

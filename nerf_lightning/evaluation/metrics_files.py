@@ -63,3 +63,14 @@ def write_metrics(folder: Path, result: dict[str, Any]) -> None:
         writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({key: for_csv(value) for key, value in row.items()} for row in result["per_image"])
+
+
+def as_text(value: Any) -> str:
+    """Return a value of `metrics.json` as a person reads it: sizes as width x height.
+
+    >>> as_text([[800, 800], [400, 300]]), as_text("white")
+    ('800 x 800, 400 x 300', 'white')
+    """
+    if not isinstance(value, list):
+        return str(value)
+    return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)

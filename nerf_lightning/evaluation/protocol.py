@@ -20,6 +20,7 @@ from nerf_lightning import __version__
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.config.key_meanings import fingerprint, meaning_of
 from nerf_lightning.config.overrides import leaves
+from nerf_lightning.evaluation.metrics_files import as_text
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.rendering.blending import at_evaluation
 from nerf_lightning.nerf.types.scene import Background, Scene
@@ -152,9 +153,7 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
 
 
 def _said(protocol: Mapping[str, Any], key: str) -> str:
-    if key == "resolution" and isinstance(protocol.get(key), list):
-        return ", ".join(" x ".join(map(str, size)) for size in protocol[key] if isinstance(size, list))[:80]
-    return str(protocol[key])[:80] if key in protocol else "not said"
+    return as_text(protocol[key])[:80] if key in protocol else "not said"
 
 
 LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
-from nerf_lightning.evaluation.metrics_files import COLUMNS
+from nerf_lightning.evaluation.metrics_files import COLUMNS, as_text
 from nerf_lightning.files.json_files import mapping, number
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
@@ -115,9 +115,7 @@ def _shown(metric: str, value: Any) -> str:
 
 
 def _said(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)[:300]
-    return "none" if value is None else str(value)[:300]
+    return "none" if value is None else as_text(value)[:300]
 
 
 def _sequence(value: object) -> list[Any]:

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.runs.table import HIGH_FIRST, PLAIN, SPREAD
 from nerf_lightning.runs.table_files import Row, shown_columns
 
-HIGHEST, LOWEST = ("PSNR", "cc PSNR", "SSIM", "frames/s"), ("LPIPS", "depth error", "normal error")
+HIGHEST = tuple((SPREAD | PLAIN)[key] for key in HIGH_FIRST)
+LOWEST = tuple(column for column in SPREAD.values() if column not in HIGHEST)
 """Columns whose best value is the highest, or the lowest."""
 NOT_IN_PAPERS = ("job", "state", "folder", "source", "seeds")
 SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
@@ -65,9 +67,6 @@ def _caption(shown: dict[str, list[str]], columns: dict[str, list[str]], protoco
     told = f"{protocol.get('split', '')} views, {protocol.get('background', '')} background"
     how = [f"PSNR: {protocol['psnr']}"] if "psnr" in protocol and "PSNR" in columns else []
     how += [f"SSIM: {protocol['ssim']}"] if "ssim" in protocol and "SSIM" in columns else []
-    spread = (
-        ["mean ± standard deviation over seeds"]
-        if any("±" in cell for column in columns.values() for cell in column)
-        else []
-    )
+    is_spread = any("±" in cell for column in columns.values() for cell in column)
+    spread = ["mean ± standard deviation over seeds"] if is_spread else []
     return f"{'. '.join(re.sub(r'[.]$', '', part) for part in (', '.join([*same, told]), *how, *spread))}."

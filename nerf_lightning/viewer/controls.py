@@ -1,7 +1,6 @@
 """The panel of the page: what is shown, photographs, the camera path, the crop box, snapshots, exports."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf rende
 class Controls:
     """The panel of one person, who first sees a vertical field of `fov` (radians).
 
-    What they save lies in `folder`; `exports` can be downloaded.
+    What they save lies in `folder`; the files of the folder `exports` can be downloaded.
     """
 
     def __init__(
@@ -37,7 +36,7 @@ class Controls:
         folder: Path,
         fov: float,
         training: TrainingSwitch | None = None,
-        exports: Sequence[Path] = (),
+        exports: Path | None = None,
     ):
         self.session, self.folder = session, folder
         self.gui = session.client.gui
@@ -52,7 +51,7 @@ class Controls:
         self.photographs = PhotographPanel(session, self.frusta)
         PathPanel(session, self.path, self.frusta)
         self._add_crop()
-        if exports:
+        if exports is not None:
             ExportPanel(session, exports)
 
     def _add_view(self, degrees: float) -> None:

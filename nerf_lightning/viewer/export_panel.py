@@ -1,6 +1,5 @@
 """The panel's part for what `nerf export` has written: each file can be downloaded."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,12 @@ def exported_files(folder: Path) -> list[Path]:
 
 
 class ExportPanel:
-    """Let one person download exported files."""
+    """Let one person download what is in the folder of exports when they come."""
 
-    def __init__(self, session: ViewerClient, files: Sequence[Path]):
-        self.session = session
+    def __init__(self, session: ViewerClient, folder: Path):
+        self.session, files = session, exported_files(folder)
+        if not files:
+            return
         gui, harmless = session.client.gui, session.queue.errors.harmless
         with gui.add_folder("Exports", expand_by_default=False):
             for file in files:

@@ -42,7 +42,7 @@ class Page:
         most_height: height of the finest image, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
         training: what the page may ask of the training that it shows; None: it shows none.
-        exports: files that people can download.
+        exports: folder of files that people can download; None: none.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Page:
         most_height: int,
         hosts: Sequence[str] | None = None,
         training: TrainingSwitch | None = None,
-        exports: Sequence[Path] = (),
+        exports: Path | None = None,
     ) -> None:
         require_viser()
         from nerf_lightning.viewer.guarded_server import guarded_server

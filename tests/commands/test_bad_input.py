@@ -160,3 +160,8 @@ def test_a_broken_capture_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):
     said(result, "images.bin cannot be read", "has 100 bytes", "nerf poses images=DIR")
     assert not (tmp_path / "run").exists()
     assert not list(tmp_path.rglob("*.pixels"))
+
+
+def test_a_setting_that_the_chosen_part_does_not_have_names_what_removes_it(nerf):
+    result = nerf("train", "experiment=lego_article", "scene=bricks")
+    said(result, "scene.downscale is set, but the chosen scene has no such setting", "remove it with ~scene.downscale")

@@ -66,7 +66,7 @@ class Gui:
 class Panel:
     """A person's panel over a ball, and the queue that serves them."""
 
-    def __init__(self, folder, scene=None, exports=(), **changed):
+    def __init__(self, folder, scene=None, exports=None, **changed):
         capture, scene = scene, scene or ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
         self.queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))

@@ -1,6 +1,7 @@
 // ---- The scene as 3D Gaussian splats (Kerbl et al. 2023), drawn from the farthest to the nearest ----------------
 
 const BUCKETS = 1 << 16;  // Of distances, by their logarithms.
+const CORNERS = [0, 1, 2, 2, 1, 3];  // Of a quad, as two triangles.
 
 // The planes of bytes of quantized.py: places, and for each splat texels of quaternion, sizes and opacity, color, harmonics.
 function splatsOf(about, content) {
@@ -72,7 +73,8 @@ class Picture {
     this.texture(2, "order", gl.R32UI, across, down, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order);
     Object.assign(this, { across, down });
     // Two triangles each, not an instance each: a processor that stands in for graphics draws instances one by one.
-    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    const corners = new Uint32Array(6 * count);
+    for (let i = 0; i < corners.length; i++) corners[i] = 4 * Math.floor(i / 6) + CORNERS[i % 6];
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.uniform1i(this.at("across"), across);

@@ -68,7 +68,7 @@ def test_a_print_is_closed_solid_upright_and_in_millimeters(tmp_path, metres, ra
     """A hollow ball that the camera's frame has tipped over, in units half as long as the scene's."""
 
     def hollow(points):
-        return ball()(points) * (points.norm(dim=-1) > 0.6)
+        return torch.maximum(ball()(points), 0.6 - points.norm(dim=-1))
 
     to_user = similarity(upright_rotation(torch.tensor([0.6, 0.0, 0.8])).mT, torch.tensor([5.0, 6.0, 7.0]), 2.0)
     mesh = exported(
