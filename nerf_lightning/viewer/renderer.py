@@ -2,15 +2,15 @@
 
 import time
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.geometry.quads import QUAD, from_quads, pixels_in_quads, quads_between
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -72,7 +72,7 @@ class SlicedRenderer:
         cameras, near, far = camera_of(look, self.scene, height)
         shape = int(cameras.height[0]), int(cameras.width[0])
         rays_of, clip = RayGenerator(cameras, near, far), None if look.crop is None else Clip(box=look.crop)
-        parts, start, total = [], 0, shape[0] * shape[1]
+        parts, start, total = [], 0, pixels_in_quads(*shape)
         while start < total:
             stop = start + self._rays_in_a_slice(total - start)
             began = time.perf_counter()
@@ -82,16 +82,17 @@ class SlicedRenderer:
             self.rays_per_second = (1 - FRESH) * before + FRESH * measured
             start = stop
             yield
-        rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
-        return View(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape), cameras)
+        columns = (torch.cat(column) for column in zip(*parts, strict=True))
+        rgb, depth, opacity = (from_quads(column, *shape) for column in columns)
+        return View(rgb, depth, opacity, cameras)
 
     def _slice(self, rays_of: RayGenerator, part: slice, clip: Clip | None) -> tuple[Tensor, Tensor, Tensor]:
-        rays, straight = view_rays(rays_of, pixels_between(rays_of.cameras, 0, part), clip)
-        seen = render_rays(self.model, rays, self.background, self.tile_points)
+        rays, straight = view_rays(rays_of, quads_between(rays_of.cameras, 0, part), clip)
+        seen = render_rays(self.model, replace(rays, together=QUAD), self.background, self.tile_points)
         depth = surface_depth(seen.depth, seen.opacity, rays.far)
         return seen.rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), seen.opacity
 
     def _rays_in_a_slice(self, left: int) -> int:
-        rays = max(64, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS))
+        rays = QUAD * max(16, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS / QUAD))
         # No crumb at the end: it would cost as much as a slice.
         return left if left < 1.5 * rays else rays

@@ -64,7 +64,17 @@ class ProposalLevel(DenseLevel):
         history: list[DenseRendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Sample, ask the field for its density, and return the weights; without gradients where it does not learn."""
+        """Sample, ask the field for its density, and return the weights; without gradients where it does not learn.
+
+        Rays of pixels that touch share the weights of the ray between them: the proposal's cells are wider than pixels.
+        """
+        if rays.together > 1 and random is None:
+            between = [each[:: rays.together] for each in history]
+            seen = super().forward(
+                rays.between(), None if background is None else background[:: rays.together], between, None
+            )
+            seen = seen.map(lambda each: each.repeat_interleave(rays.together, dim=0))
+            return replace(seen, samples=self.sampler(rays, history, None))
         with torch.set_grad_enabled(torch.is_grad_enabled() and self._learns):
             return super().forward(rays, background, history, random)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.geometry.quads import QUAD, from_quads, pixels_in_quads, quads_between
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import FEWEST_ROWS, PARTS_PER_THREAD, in_parallel, threads_on
@@ -72,7 +73,7 @@ def render_picture(
         rays, straight = view_rays(rays_of, pixels, clip, *at)
         if seen_from is not None:
             rays = replace(rays, view_directions=view_rays(seen_from, pixels, None, *at)[1].view_directions)
-        shown = rays.to(device)
+        shown = replace(rays.to(device), together=QUAD)
         seen = (_render_tile if clip is None else _render_what_is_left)(model, shown, background)
         if cameras.ndc is not None:
             whole = rays.far if clip is None else view_rays(rays_of, pixels, None, *at)[0].far
@@ -80,7 +81,7 @@ def render_picture(
         return seen
 
     def render(part: slice) -> Picture:
-        pixels = pixels_between(cameras, view, part)
+        pixels = quads_between(cameras, view, part)
         first, *others = subpixels.offsets()
         total = through(first, pixels)
         for offset in others:
@@ -88,8 +89,8 @@ def render_picture(
         return total.map(lambda each: each / subpixels.per_pixel) if others else total
 
     height, width = int(cameras.height[view]), int(cameras.width[view])
-    picture = _in_tiles(model, height * width, tile_points, render)
-    return picture.map(lambda column: column.view(height, width, *column.shape[1:]))
+    picture = _in_tiles(model, pixels_in_quads(height, width), tile_points, render, QUAD)
+    return picture.map(lambda column: from_quads(column, height, width))
 
 
 @torch.no_grad()
@@ -148,17 +149,23 @@ def render_rays(model: Model, rays: RayBundle, background: Background, tile_poin
     """Return what rays see, as at evaluation, on the CPU.
 
     Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
+    Rays that share (`together`) are not cut apart.
     """
     device = next(model.parameters()).device
 
     def render(part: slice) -> Picture:
         return _render_what_is_left(model, rays[part].to(device), background)
 
-    return _in_tiles(model, rays.near.numel(), tile_points, render)
+    return _in_tiles(model, rays.near.numel(), tile_points, render, rays.together)
 
 
-def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slice], Picture]) -> Picture:
-    """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory."""
+def _in_tiles(
+    model: Model, count: int, tile_points: int, render: Callable[[slice], Picture], together: int = 1
+) -> Picture:
+    """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory.
+
+    Tiles are not cut between rays that come together.
+    """
     at_once = tile_rays_for(model, tile_points)
     if model.takes_whole_rays(next(model.parameters()).device, training=False):
         at_once = max(at_once, WHOLE_RAYS)
@@ -167,16 +174,16 @@ def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slic
         at_once = min(at_once, model.most_rays)
     while True:
         try:
-            return _fill(model, count, at_once, render)
+            return _fill(model, count, at_once, render, together)
         except RuntimeError as error:
-            if at_once == 1 or not is_out_of_memory(error):
+            if at_once <= together or not is_out_of_memory(error):
                 raise
         forget_workspaces()
         model.most_rays = at_once = at_once // 2
         log.warning("out of memory: rendering %d rays at a time from now on", at_once)
 
 
-def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture]) -> Picture:
+def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture], together: int) -> Picture:
     # Made once: thousands of small results between what comes and goes would leave holes many times their size.
     first_rgb = None if model.first_picture is None else torch.empty(count, 3)
     picture, making = Picture(torch.empty(count, 3), torch.empty(count), torch.empty(count), first_rgb), Lock()
@@ -195,7 +202,7 @@ def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Pict
     threads = threads_on(next(model.parameters()).device)
     if threads > 1:  # small pictures, too, are shared out
         at_once = min(at_once, max(FEWEST_ROWS, -(-count // (PARTS_PER_THREAD * threads))))
-    parts = list(tiles(count, at_once, multiple=threads))
+    parts = list(tiles(count, at_once, together, multiple=threads))
     if threads > 1:
         in_parallel(fill, parts)
     else:
@@ -211,14 +218,15 @@ def _sum(one: Picture, other: Picture) -> Picture:
 
 def _render_what_is_left(model: Model, rays: RayBundle, background: Background) -> Picture:
     """Render the rays of which something is left; the others see the background."""
-    count = rays.near.numel()
+    count, left = rays.near.numel(), (rays.far > rays.near).nonzero()[:, 0]
+    if left.numel() == count:
+        return _render_tile(model, rays, background)
     behind = background_colors(background, count, torch.device("cpu"), random=None)
     empty = torch.zeros(count, 3) if behind is None else behind
     first_rgb = None if model.first_picture is None else empty.clone()
     picture = Picture(empty, rays.far.cpu().clone(), torch.zeros(count), first_rgb)
-    left = (rays.far > rays.near).nonzero()[:, 0]
     if left.numel():
-        seen, left = _render_tile(model, rays[left], background), left.cpu()
+        seen, left = _render_tile(model, replace(rays[left], together=1), background), left.cpu()
         picture.channels.update({name: torch.zeros(count, each.shape[1]) for name, each in seen.channels.items()})
         for column, part in zip(picture.tensors(), seen.tensors(), strict=True):
             column[left] = part.to(column)

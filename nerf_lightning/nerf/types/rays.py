@@ -1,6 +1,6 @@
 """Rays, where they are sampled, and the pixels that they belong to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -30,6 +30,18 @@ class RayBundle(TensorStruct):
     pixel_side: Float[Tensor, "*rays 2"] | None = None
     """Side of the ray's pixel (root of its area) at distance 0, and by how much it grows per unit of distance; None for
     rays that are no pixel's."""
+    together: int = 1
+    """So many rays after one another belong to pixels of a picture that touch, and may share where they are sampled."""
+
+    def between(self) -> "RayBundle":
+        """Return the ray in the middle of those that come together, and of what has no middle that of the first."""
+        count = self.together
+
+        def middle(column: Tensor) -> Tensor:
+            return column.unflatten(0, (-1, count)).mean(dim=1) if column.is_floating_point() else column[::count]
+
+        rays = replace(self, together=1).map(middle)
+        return replace(rays, directions=torch.nn.functional.normalize(rays.directions, dim=-1))
 
 
 @dataclass(frozen=True)

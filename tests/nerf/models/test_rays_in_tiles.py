@@ -9,10 +9,11 @@ from support.scenes import LENSES, ball_scene, tiny_model
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf import row_chunks
-from nerf_lightning.nerf.geometry.cameras import all_pixels, resized
+from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+from nerf_lightning.nerf.geometry.quads import QUAD, from_quads, pixels_in_quads, quads_between
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models import render_image
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -38,18 +39,18 @@ CAMERAS = {
 
 def through_all_at_once(offset, model, generator, view):
     """A picture as it was rendered before: all rays, then tile by tile."""
-    pixels = all_pixels(generator.cameras, view)
-    rays = generator(pixels, offset, model.subpixels.per_side)
-    flat, seen = rays.map(lambda each: each.flatten(0, 1)), []
-    for part in tiles(flat.near.numel(), tile_rays_for(model, TILE)):
+    height, width = int(generator.cameras.height[view]), int(generator.cameras.width[view])
+    pixels = quads_between(generator.cameras, view, slice(0, pixels_in_quads(height, width)))
+    rays, seen = generator(pixels, offset, model.subpixels.per_side), []
+    for part in tiles(rays.near.numel(), tile_rays_for(model, TILE), QUAD):
         behind = background_colors("white", part.stop - part.start, torch.device("cpu"), None)
-        levels = model(flat[part], behind, None)
+        levels = model(rays[part], behind, None)
         seen.append((levels[-1].rgb, levels[-1].depth, levels[-1].opacity, levels[model.first_picture].rgb))
     columns = (torch.cat(column) for column in zip(*seen, strict=True))
-    rgb, depth, opacity, first = (column.view(*rays.near.shape, *column.shape[1:]) for column in columns)
+    rgb, depth, opacity, first = columns
     if generator.ndc is not None:
         depth = world_distance(generator.through_world(pixels, offset), depth / rays.far)
-    return rgb, depth, opacity, first
+    return tuple(from_quads(column, height, width) for column in (rgb, depth, opacity, first))
 
 
 @pytest.mark.parametrize(

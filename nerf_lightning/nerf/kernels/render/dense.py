@@ -1,8 +1,8 @@
 """Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
 
-The samples of a part of the rays follow one another, ray by ray (in pictures group by group), and ROWS of them go from
-positions to light while they are in the cache. The way back takes the blocks from the last to the first, so that of
-each ray those samples come first that lie farthest, and sums up what lies behind each.
+The samples of a part of the rays follow one another, ray by ray (without gradients group by group), and ROWS of them
+go from positions to light while they are in the cache. The way back takes the blocks from the last to the first, so
+that of each ray those samples come first that lie farthest, and sums up what lies behind each.
 
 Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
 """
@@ -37,7 +37,7 @@ from nerf_lightning.nerf.kernels.mlp.vectors import LANES, bytes_of, round_vecto
 from nerf_lightning.nerf.kernels.render.compositing import BACK, COLOR, LIGHT, SHARE, WEIGHT, absorb, new_rooms, shade
 from nerf_lightning.nerf.kernels.render.cpu import arrays_of, network
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
+from nerf_lightning.nerf.kernels.render.workspace import NUMBERS, Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
@@ -46,6 +46,8 @@ FEWEST_RAYS = 32
 BESIDE = 64
 """Of so many neighboring rays of a picture the first samples come first, then the second ones: they share the grid's
 cells. A batch's rays are no neighbors, and only the samples of one ray are."""
+LEAST_WEIGHT = np.float32(1e-4)
+"""Where rays may end early, samples of less weight have no color."""
 COPY = np.float32(0)
 """Tells `round_vector` to round to float32, which is to copy."""
 
@@ -57,6 +59,7 @@ def render(
     dtype: torch.dtype,
     closed: bool,
     whole_from: float,
+    opaque_below: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
     """Return the weights of all samples, and per ray sum of w rgb (nothing, for a field without colors).
 
@@ -70,11 +73,12 @@ def render(
         dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
         closed: whether the last interval takes all the light that is left.
         whole_from: `rendering.near_gradients`; 0: gradients are whole everywhere.
+        opaque_below: without gradients, a sample behind which less light is left takes all of it; 0: none does.
     """
     features = field.ray_features(rays) if field.color_weights else torch.zeros(len(edges), 0)
     given = rays.origins, rays.directions, features, field.table, *field.density_weights, *field.color_weights
     keep = torch.is_grad_enabled() and any(each.requires_grad for each in given)
-    return _DenseRays.apply(_Call(edges, field, dtype, closed, whole_from, keep), *given)
+    return _DenseRays.apply(_Call(edges, field, dtype, closed, whole_from, opaque_below, keep), *given)
 
 
 def trial() -> None:
@@ -93,8 +97,10 @@ def trial() -> None:
         field = FieldParts(
             aabb, table, layout, 0.0, density, color, lambda rays: torch.ones(len(rays.near), 16), contracted=True
         )
-        weights, foreground = render(rays, edges, field, dtypes()[-1], False, 1.0)
+        weights, foreground = render(rays, edges, field, dtypes()[-1], False, 1.0, 0.0)
         (weights.sum() + foreground.sum()).backward()
+        with torch.no_grad():
+            render(rays, edges, field, dtypes()[-1], False, 0.0, 1e-3)
 
 
 @dataclass
@@ -106,6 +112,7 @@ class _Call:
     dtype: torch.dtype
     closed: bool
     whole_from: float
+    opaque_below: float
     keep: bool
     """Whether a backward pass follows."""
 
@@ -145,29 +152,27 @@ class _Call:
         """Render, and keep what the backward pass needs."""
         weights = list(given)
         density, color = self.split(weights)
-        out = torch.empty(self.rays, self.samples), torch.zeros(self.rays, 3)
+        # A ray that ends early has no weights behind its end.
+        out = (torch.empty if self.keep else torch.zeros)(self.rays, self.samples), torch.zeros(self.rays, 3)
         words = [words_of(sum(padded_widths(each)[:-1]), self.dtype) if each else 0 for each in (density, color)]
         space, grid, networks = self.space(origins, directions), self.grid(table), self.networks(weights, False)
-        numbers = (
-            np.float32(self.field.bias),
-            np.float32(self.whole_from),
-            self.closed,
-            self.field.handed_over(features.shape[1]),
-        )
+        limit = np.float32(self.whole_from if self.keep else self.opaque_below)
+        numbers = np.float32(self.field.bias), limit, self.closed, self.field.handed_over(features.shape[1])
         of_rays, shown = arrays_of((features.float(),))[0], arrays_of(out)
 
-        def part(bounds: tuple[int, int]) -> Workspace:
-            blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS) if self.keep else 1
+        def keep(bounds: tuple[int, int]) -> Workspace:
+            blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS)
             workspace = take_workspace(blocks * ROWS, (words[0], words[1]))
             kept = workspace.arrays()[1:]
-            _forward(self.kind, *bounds, self.keep, space, of_rays, grid, networks, numbers, kept, shown)
+            _forward(self.kind, *bounds, space, of_rays, grid, networks, numbers, kept, shown)
             return workspace
 
-        workspaces = in_parallel(part, self.parts)
         if self.keep:
-            self.workspaces = workspaces
+            self.workspaces = in_parallel(keep, self.parts)
         else:
-            give_back(workspaces)
+            in_parallel(
+                lambda bounds: _show(self.kind, *bounds, space, of_rays, grid, networks, numbers, shown), self.parts
+            )
         return out
 
     def backward(
@@ -232,31 +237,51 @@ class _DenseRays(torch.autograd.Function):
         return None, *of_rays, of_table, *of_weights
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@njit
 @no_type_check
-def _place(space, first, last, start, count, beside, block, points):
-    # Which ray each sample of a block is on, and its distance, length and place, in the unit cube.
-    origins, directions, edges, contracted = space
-    owner, column, sample, t, delta, x, y, z = block
-    samples = edges.shape[1] - 1
-    group, rest = start // (beside * samples), start % (beside * samples)
-    leftmost = first + group * beside
-    width = min(beside, last - leftmost)
-    k, c = rest // width, rest % width
+def _next_of_rays(first, samples, start, count, block):
+    # Which samples of which rays a block has: ray after ray.
+    r, k = first + start // samples, start % samples
     for i in range(count):
+        block[0][i], block[1][i] = r, k
+        k += 1
+        if k == samples:
+            r, k = r + 1, 0
+
+
+@njit
+@no_type_check
+def _next_of_groups(first, last, samples, at, lights, block):
+    # The same, where rays lie beside each other: the samples of one number, of those that light still gets through to.
+    leftmost, k, c = at
+    count, width = 0, min(BESIDE, last - leftmost)
+    while count < ROWS and leftmost < last:
         r = leftmost + c
-        begin, end = edges[r, k], edges[r, k + 1]
-        middle = HALF * (begin + end)
-        owner[i], column[i], sample[i], t[i], delta[i] = r, c, k, middle, end - begin
-        x[i] = origins[r, 0] + middle * directions[r, 0]
-        y[i] = origins[r, 1] + middle * directions[r, 1]
-        z[i] = origins[r, 2] + middle * directions[r, 2]
+        block[0][count], block[1][count] = r, k
+        count += lights[r - first] > ZERO
         c += 1
         if c == width:
             c, k = 0, k + 1
         if k == samples:
-            k, leftmost = 0, leftmost + beside
-            width = min(beside, last - leftmost)
+            k, leftmost = 0, leftmost + BESIDE
+            width = min(BESIDE, last - leftmost)
+    return count, (leftmost, k, c)
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+@no_type_check
+def _place(space, count, block, points):
+    # Distance, length and place of a block's samples, in the unit cube.
+    origins, directions, edges, contracted = space
+    owner, sample, t, delta, x, y, z = block
+    for i in range(count):
+        r, k = owner[i], sample[i]
+        begin, end = edges[r, k], edges[r, k + 1]
+        middle = HALF * (begin + end)
+        t[i], delta[i] = middle, end - begin
+        x[i] = origins[r, 0] + middle * directions[r, 0]
+        y[i] = origins[r, 1] + middle * directions[r, 1]
+        z[i] = origins[r, 2] + middle * directions[r, 2]
     for i in range(count):
         factor, shift = ONE, ZERO
         if contracted:
@@ -267,16 +292,16 @@ def _place(space, first, last, start, count, beside, block, points):
 
 @njit
 @no_type_check
-def _composite(count, closed, block, alpha, lights, numbers, weights):
-    # From front to back; each ray of a group has a column, where the light behind its last sample stands.
+def _composite(count, first, closed, opaque_below, block, alpha, lights, numbers, weights):
+    # From front to back; `lights` has what is left behind the last sample of each ray.
     last = weights.shape[1] - 1
     for i in range(count):
-        r, c, k = block[0][i], block[1][i], block[2][i]
-        light = lights[c] if k > 0 else ONE
+        r, k = block[0][i], block[1][i]
+        light = lights[r - first]
         w = light * alpha[i]
-        if closed and k == last:
+        if light - w < opaque_below or (closed and k == last):
             w, numbers[i, BACK] = light, ZERO
-        lights[c] = light - w
+        lights[r - first] = light - w
         numbers[i, LIGHT], numbers[i, WEIGHT], weights[r, k] = light - w, w, w
 
 
@@ -293,27 +318,25 @@ def _copy_numbers(source, target, count):
 
 @njit
 @no_type_check
-def _color_inputs(count, hidden, flat, outer, owner, of_rays, inputs):
-    # What the density hands over, and behind it what all samples of a ray share.
-    given, shared = address(flat), of_rays.shape[1]
-    for i in range(count):
-        r, to = owner[i], address(inputs) + 4 * i * inputs.shape[1]
-        for c in range(_copy_numbers(given + 4 * i * outer, to, hidden), hidden):
-            inputs[i, c] = flat[i * outer + c]
-        for c in range(_copy_numbers(address(of_rays) + 4 * r * shared, to + 4 * hidden, shared), shared):
-            inputs[i, hidden + c] = of_rays[r, c]
+def _color_inputs(i, r, hidden, flat, outer, of_rays, inputs, row):
+    # Of a block's sample what the density hands over, and behind it what all samples of its ray share.
+    shared, to = of_rays.shape[1], address(inputs) + 4 * row * inputs.shape[1]
+    for c in range(_copy_numbers(address(flat) + 4 * i * outer, to, hidden), hidden):
+        inputs[row, c] = flat[i * outer + c]
+    for c in range(_copy_numbers(address(of_rays) + 4 * r * shared, to + 4 * hidden, shared), shared):
+        inputs[row, hidden + c] = of_rays[r, c]
 
 
 @njit
 @no_type_check
 def _new_block():
-    whole, floats = np.zeros((3, ROWS), np.int64), np.zeros((5, ROWS), np.float32)
-    return whole[0], whole[1], whole[2], floats[0], floats[1], floats[2], floats[3], floats[4]
+    whole, floats = np.zeros((2, ROWS), np.int64), np.zeros((5, ROWS), np.float32)
+    return whole[0], whole[1], floats[0], floats[1], floats[2], floats[3], floats[4]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of_call, kept, out):
+def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call, kept, out):
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
     bias, whole_from, closed, hidden = numbers_of_call
@@ -323,27 +346,84 @@ def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of
     block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32)
-    beside = 1 if keep else BESIDE
-    lights = np.zeros(beside, np.float32)
+    lights = np.ones(last - first, np.float32)
     flat, outer = sums.reshape(-1), dims[-1]
     stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
     total = (last - first) * samples
     for start in range(0, total, ROWS):
-        count, row = min(ROWS, total - start), start if keep else 0
-        numbers, points = all_numbers[row : row + ROWS], all_points[row : row + ROWS]
-        _place(space, first, last, start, count, beside, block, points)
+        count = min(ROWS, total - start)
+        numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
+        _next_of_rays(first, samples, start, count, block)
+        _place(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
-        x, y = address(density_kept) + row * stride, address(sums)
+        x, y = address(density_kept) + start * stride, address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
         through(kind, x, stride, address(density_words), dims, y, y)
-        absorb(count, flat, outer, bias, space[3], whole_from, block[4], block[3], points, numbers, rooms)
-        _composite(count, closed, block, rooms[2], lights, numbers, weights)
+        absorb(count, flat, outer, bias, space[3], whole_from, block[3], block[2], points, numbers, rooms)
+        _composite(count, first, closed, ZERO, block, rooms[2], lights, numbers, weights)
         if colored:
-            _color_inputs(count, hidden, flat, outer, block[0], of_rays, inputs)
-            x = address(color_kept) + row * color_stride
+            for i in range(count):
+                _color_inputs(i, block[0][i], hidden, flat, outer, of_rays, inputs, i)
+            x = address(color_kept) + start * color_stride
             round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
             through(kind, x, color_stride, address(color_words), color_dims, y, y)
             shade(count, flat, color_dims[-1], block[0], numbers, rooms, foreground)
+
+
+@njit
+@no_type_check
+def _show_colors(kind, count, hues, color_words, color_dims, rooms, foreground):
+    # Of samples that have waited: add their weighted colors to what their rays show.
+    owners, inputs, numbers, words, sums = hues
+    stride = bytes_of(kind) * color_dims[:-1].sum()
+    x, y = address(words), address(sums)
+    round_rows(kind, address(inputs), 4 * color_dims[0], x, stride, ROWS, color_dims[0])
+    through(kind, x, stride, address(color_words), color_dims, y, y)
+    shade(count, sums.reshape(-1), color_dims[-1], owners, numbers, rooms, foreground)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+@no_type_check
+def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, out):
+    # As `_forward`, with no way back: rays end where they are opaque, and samples with some weight wait for their
+    # colors until there is a block of them.
+    table, resolutions, offsets, hashed, mask, lanes = grid
+    density_words, dims, color_words, color_dims = networks
+    bias, opaque_below, closed, hidden = numbers_of_call
+    weights, foreground = out
+    samples, colored, size = space[2].shape[1] - 1, color_dims.shape[0] > 0, bytes_of(kind)
+    block, rooms, points = _new_block(), new_rooms(), np.zeros((ROWS, 3), np.float32)
+    numbers, features = np.zeros((ROWS, NUMBERS), np.float32), np.zeros((ROWS, dims[0]), np.float32)
+    sums, stride = np.zeros((ROWS, dims.max()), np.float32), size * dims[:-1].sum()
+    words, lights = np.zeros(ROWS * stride // 4, np.int32), np.ones(last - first, np.float32)
+    hues = (
+        np.zeros(ROWS, np.int64),
+        np.zeros((ROWS, color_dims[0] if colored else 0), np.float32),
+        np.zeros((ROWS, NUMBERS), np.float32),
+        np.zeros(ROWS * size * (color_dims[:-1].sum() if colored else 0) // 4, np.int32),
+        np.zeros((ROWS, color_dims.max() if colored else 0), np.float32),
+    )
+    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
+    while at[0] < last:
+        count, at = _next_of_groups(first, last, samples, at, lights, block)
+        _place(space, count, block, points)
+        encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
+        x, y = address(words), address(sums)
+        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
+        through(kind, x, stride, address(density_words), dims, y, y)
+        flat = sums.reshape(-1)
+        absorb(count, flat, dims[-1], bias, space[3], ZERO, block[3], block[2], points, numbers, rooms)
+        _composite(count, first, closed, opaque_below, block, rooms[2], lights, numbers, weights)
+        for i in range(count if colored else 0):
+            if numbers[i, WEIGHT] > least:
+                _color_inputs(i, block[0][i], hidden, flat, dims[-1], of_rays, hues[1], waiting)
+                hues[0][waiting], hues[2][waiting, WEIGHT] = block[0][i], numbers[i, WEIGHT]
+                waiting += 1
+            if waiting == ROWS:
+                _show_colors(kind, waiting, hues, color_words, color_dims, rooms, foreground)
+                waiting = 0
+    if waiting > 0:
+        _show_colors(kind, waiting, hues, color_words, color_dims, rooms, foreground)
 
 
 @njit
@@ -394,7 +474,7 @@ def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
 @no_type_check
 def _move_rays(count, contracted, block, toward, of_origins, of_directions):
     # From gradients of points in the unit cube to those of rays: y = x f / 4 + 1/2, with f = 2 / |x| - 1 / |x|^2.
-    owner, _, _, t, _, x, y, z = block
+    owner, _, t, _, x, y, z = block
     for i in range(count):
         r, gx, gy, gz = owner[i], toward[i, 0], toward[i, 1], toward[i, 2]
         if contracted:
@@ -435,7 +515,8 @@ def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, 
     for start in range((total - 1) // ROWS * ROWS, -1, -ROWS):
         count, row = min(ROWS, total - start), first * samples + start
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
-        _place(space, first, last, start, count, 1, block, points)
+        _next_of_rays(first, samples, start, count, block)
+        _place(space, count, block, points)
         behind = _composite_back(
             count, start, first, samples, colored, least_slope, grads, numbers, behind, color_outer, flat, raw
         )

@@ -128,7 +128,8 @@ def render_dense_rays(
     field: FieldParts,
     matmul_precision: MatmulPrecision,
     closed: bool,
-    whole_from: float,
+    whole_from: float = 0.0,
+    opaque_below: float = 0.0,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
     """Render rays with the kernel that `has_dense_kernel` found; return all weights, and sums of weights times color.
 
@@ -139,9 +140,10 @@ def render_dense_rays(
         matmul_precision: the precision of the field's products.
         closed: whether the last interval takes all the light that is left.
         whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
+        opaque_below: in rendering, a sample behind which less light is left takes all of it, and ends the ray; 0: none.
     """
     kernels: Any = cpu_backend(DENSE, rays.near.device)
-    return kernels.render(rays, edges, field, _dtype(matmul_precision), closed, whole_from)
+    return kernels.render(rays, edges, field, _dtype(matmul_precision), closed, whole_from, opaque_below)
 
 
 def _dtype(matmul_precision: MatmulPrecision) -> torch.dtype:
