@@ -20,7 +20,7 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
 OPAQUE_BELOW = 1e-3
-"""Rays of pictures end where less light than this is left, as those of a `RaggedSampler`."""
+"""Rays end where less light than this is left, as those of a `RaggedSampler`."""
 
 
 class DenseLevel(Level):
@@ -69,7 +69,7 @@ class DenseLevel(Level):
         """Sample, ask the field at the midpoints, composite.
 
         Rays are first offered to a kernel that does the last two in one; the way below is its reference. Only the
-        kernel ends rays of pictures where they are opaque.
+        kernel ends rays where they are opaque.
         """
         samples = self.sampler(rays, history, random)
         whole_from = 0.0 if random is None else self.gradient_scaling_distance
@@ -80,9 +80,8 @@ class DenseLevel(Level):
             *sums, weights = integrated
             return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
         if parts is not None and rays.near.device.type == "cpu":
-            opaque_below = OPAQUE_BELOW if random is None else 0.0
             weights, foreground = render_dense_rays(
-                rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from, opaque_below
+                rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from, OPAQUE_BELOW
             )
             return rendering_of(weights, foreground, samples, rays, background)
         seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))

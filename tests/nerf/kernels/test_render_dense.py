@@ -35,6 +35,12 @@ def a_level(kind=DenseLevel, samples=10, features=4, bias=-1.0, spread=0.5, scal
     return kind(StratifiedSampler(samples), ngp, gradient_scaling_distance=scaling)
 
 
+@pytest.fixture(autouse=True)
+def _to_the_end(monkeypatch):
+    """Rays do not end early, as in plain torch."""
+    monkeypatch.setattr(dense_level, "OPAQUE_BELOW", 0.0)
+
+
 def learnt(level, rays, random, grads, background):
     """Return what is seen, and the gradients of all that learns, rays included."""
     level.zero_grad(set_to_none=True)
@@ -105,9 +111,10 @@ def test_rays_of_pictures_end_where_they_are_opaque(closed, kind, monkeypatch):
     level, rays = a_level(kind, samples=40, bias=2.0, contraction=True), some_rays(500)
     background = None if closed else torch.rand(500, 3)
     with torch.no_grad():
+        whole = level(rays, background, [], None)
+        monkeypatch.setattr(dense_level, "OPAQUE_BELOW", 1e-3)
         ended = level(rays, background, [], None)
         monkeypatch.setattr(dense_level, "OPAQUE_BELOW", 0.0)
-        whole = level(rays, background, [], None)
         with without(*PLAIN):
             torch.testing.assert_close(whole.rgb, level(rays, background, [], None).rgb, rtol=1e-4, atol=1e-5)
     light = 1 - whole.weights.cumsum(dim=1)
@@ -118,6 +125,23 @@ def test_rays_of_pictures_end_where_they_are_opaque(closed, kind, monkeypatch):
     assert torch.equal(ended.weights[before], whole.weights[before])
     torch.testing.assert_close(ended.opacity, whole.opacity, rtol=0, atol=1.1e-3)
     torch.testing.assert_close(ended.rgb, whole.rgb, rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("kind", [DenseLevel, ProposalLevel])
+def test_rays_that_learn_end_as_well_and_learn_nearly_the_same(closed, kind, monkeypatch):
+    level, rays, random = a_level(kind, samples=40, bias=2.0, contraction=True), some_rays(500), batch_random(5, 500)
+    background, grads = None if closed else torch.rand(500, 3), torch.randn(500, 45)
+    whole, of_whole = learnt(level, rays, random, grads, background)
+    monkeypatch.setattr(dense_level, "OPAQUE_BELOW", 1e-3)
+    ended, of_ended = learnt(level, rays, random, grads, background)
+    assert 0.2 < float((ended[:, :40] == 0.0).float().mean()) < 0.9
+    torch.testing.assert_close(ended, whole, rtol=0, atol=5e-3)
+    for name, gradient in of_ended.items():
+        assert 0.0 < far_apart(gradient, of_whole[name]) < 0.02, name
+    with torch.no_grad():
+        shown = level(rays, background, [], random)
+    assert torch.equal(shown.weights, ended[:, :40])
 
 
 def test_codes_of_photographs_learn_and_without_a_photograph_their_mean_is_seen():

@@ -271,29 +271,32 @@ def _turn(source, rows, width, target):
 
 @njit
 @no_type_check
-def through(kind, x, stride, w, dims, y, into):
-    """Send ROWS rows through all layers: numbers at x, with room for all layers' inputs; the end goes to `into`."""
+def through(kind, x, w, dims, y, into):
+    """Send ROWS rows through all layers, and the end to `into`; at x there is room for all layers' inputs.
+
+    ROWS rows of the first layer's, which are there, those of the second, and so on: memory is written from its
+    beginning to its end, where rows of all layers, with gaps in each, took twice as long.
+    """
     layers, size = len(dims) - 1, bytes_of(kind)
     open_tiles(kind)
     for layer in range(layers):
         inner, outer = dims[layer], dims[layer + 1]
         last = layer == layers - 1
-        _multiply(kind, x, stride, 4, w, into if last else y, outer, ROWS, inner * size // 4, 0)
-        x, w = x + size * inner, w + size * inner * outer
+        _multiply(kind, x, size * inner, 4, w, into if last else y, outer, ROWS, inner * size // 4, 0)
+        x, w = x + ROWS * size * inner, w + size * inner * outer
         if not last:
-            _activate(kind, y, outer, x, stride)
+            _activate(kind, y, outer, x, size * outer)
     close_tiles(kind)
 
 
 @njit
 @no_type_check
-def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inputs, into):
+def back_through(kind, x, w, dims, dy, y, upper, lower, total, wants_inputs, into):
     """Send gradients of ROWS rows back through all layers.
 
     Args:
         kind: of the words.
-        x: address of what `through` has left of the first row.
-        stride: bytes from row to row of it.
+        x: address of what `through` has left of all layers' inputs.
         w: address of all layers' words, transposed.
         dims: widths of all layers' inputs, and of what comes out.
         dy: address of the gradients of what came out, numbers of the kind; there is room for the widest layer's, too.
@@ -311,7 +314,7 @@ def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inp
     for layer in range(len(dims) - 2, -1, -1):
         inner, outer = dims[layer], dims[layer + 1]
         before, numbers = before - inner, numbers - inner * outer
-        inputs, words = x + size * before, w + size * numbers
+        inputs, words = x + ROWS * size * before, w + size * numbers
         # dW[o, i] = sum over rows of dy[row, o] x[row, i]
         if is_tiled(kind):  # which want what is summed over side by side
             _stack_rows(kind, dy, size * outer, outer, lower)
@@ -320,11 +323,11 @@ def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inp
         else:
             _stack_rows(kind, dy, size * outer, outer, upper)
             next_row, next_word = 4, 4 * outer
-        _stack_rows(kind, inputs, stride, inner, lower)
+        _stack_rows(kind, inputs, size * inner, inner, lower)
         _multiply(kind, upper, next_row, next_word, lower, total + 4 * numbers, inner, outer, ROWS * size // 4, 1)
         if layer:
             _multiply(kind, dy, size * outer, 4, words, y, inner, ROWS, outer * size // 4, 0)
-            _pass_back(kind, y, inner, inputs, stride, dy)
+            _pass_back(kind, y, inner, inputs, size * inner, dy)
         elif wants_inputs:
             _multiply(kind, dy, size * outer, 4, words, into, inner, ROWS, outer * size // 4, 0)
     close_tiles(kind)
@@ -341,12 +344,14 @@ def _forward(kind, first, last, keep, points, packed, dims, out, kept):
     for start in range(first, last, ROWS):
         count = min(ROWS, last - start)
         x = address(kept) + start * stride if keep else address(own)
-        round_rows(kind, address(points) + 4 * start * dims[0], 4 * dims[0], x, stride, count, dims[0])
-        if keep:
-            kept[start + count : start + ROWS] = 0  # the sums of the way back go over whole blocks
+        if keep and count < ROWS:
+            kept[start : start + ROWS] = 0  # the sums of the way back go over whole blocks
+        round_rows(
+            kind, address(points) + 4 * start * dims[0], 4 * dims[0], x, bytes_of(kind) * dims[0], count, dims[0]
+        )
         y = address(sums)
         into = address(out) + 4 * start * dims[layers] if whole else y
-        through(kind, x, stride, address(packed), dims, y, into)
+        through(kind, x, address(packed), dims, y, into)
         for r in range(0 if whole else count):
             for c in range(out.shape[1]):
                 out[start + r, c] = flat[r * dims[layers] + c]
@@ -378,6 +383,6 @@ def _backward(kind, first, last, wants_points, grad, packed, dims, kept, grad_po
         _round_gradient(kind, grad, start, min(ROWS, last - start), dims[layers], flat, dy)
         x, into = address(kept) + start * stride, address(grad_points) + 4 * start * dims[0]
         back_through(
-            kind, x, stride, address(packed), dims, dy, y, dy + next_room, dy + 2 * next_room, address(grads),
+            kind, x, address(packed), dims, dy, y, dy + next_room, dy + 2 * next_room, address(grads),
             wants_points, into,
         )  # fmt: skip

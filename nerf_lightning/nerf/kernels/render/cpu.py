@@ -188,9 +188,9 @@ def is_inside(points, s):
 @njit
 @no_type_check
 def _add_colors(kind, count, inputs, words, packed, dims, sums, owner, weight, foreground):
-    stride, x, y = 4 * words.shape[1], address(words), address(sums)
-    round_rows(kind, address(inputs), 4 * dims[0], x, stride, ROWS, dims[0])
-    through(kind, x, stride, address(packed), dims, y, y)
+    x, y = address(words), address(sums)
+    round_rows(kind, address(inputs), 4 * dims[0], x, bytes_of(kind) * dims[0], ROWS, dims[0])
+    through(kind, x, address(packed), dims, y, y)
     flat, outer = sums.reshape(-1), dims[-1]
     for i in range(count):
         for c in range(3):
@@ -225,9 +225,9 @@ def _render(kind, first, last, march, world, directions, hidden, table, levels, 
             begin[s], stop[s] = interval(march, ray[s], sample_index[s])
             locate(world, ray[s], HALF * (begin[s] + stop[s]), points, s)
         encode(0, live, table, points, resolutions, offsets, hashed, mask, lanes, features)
-        x, stride, y = address(words), 4 * words.shape[1], address(sums)
-        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
-        through(kind, x, stride, address(density_words), dims, y, y)
+        x, y = address(words), address(sums)
+        round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
+        through(kind, x, address(density_words), dims, y, y)
         for s in range(live):
             if not is_inside(points, s):
                 continue

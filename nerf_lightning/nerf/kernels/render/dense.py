@@ -1,8 +1,8 @@
 """Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
 
-The samples of a part of the rays follow one another, ray by ray (without gradients group by group), and ROWS of them
-go from positions to light while they are in the cache. The way back takes the blocks from the last to the first, so
-that of each ray those samples come first that lie farthest, and sums up what lies behind each.
+Some rays take turns with their samples, from front to back, and blocks of ROWS samples go from positions to light while
+they are in the cache. The way back takes the blocks from the last to the first, so that of each ray those samples come
+first that lie farthest, and sums up what lies behind each.
 
 Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
 """
@@ -43,9 +43,9 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
-BESIDE = 64
-"""Of so many neighboring rays of a picture the first samples come first, then the second ones: they share the grid's
-cells. A batch's rays are no neighbors, and only the samples of one ray are."""
+IN_PICTURES, IN_BATCHES = (64, 1), (32, 8)
+"""So many rays take turns, with so many samples each: a ray that has become opaque takes no further turn. Rays of a
+picture are neighbors, and share the grid's cells; of a batch's rays only the samples of one ray do."""
 LEAST_WEIGHT = np.float32(1e-4)
 """Where rays may end early, samples of less weight have no color."""
 COPY = np.float32(0)
@@ -73,7 +73,7 @@ def render(
         dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
         closed: whether the last interval takes all the light that is left.
         whole_from: `rendering.near_gradients`; 0: gradients are whole everywhere.
-        opaque_below: without gradients, a sample behind which less light is left takes all of it; 0: none does.
+        opaque_below: a sample behind which less light is left takes all of it, and ends its ray; 0: none does.
     """
     features = field.ray_features(rays) if field.color_weights else torch.zeros(len(edges), 0)
     given = rays.origins, rays.directions, features, field.table, *field.density_weights, *field.color_weights
@@ -120,7 +120,7 @@ class _Call:
         self.kind, self.edges = KINDS[self.dtype], self.edges.detach().float().contiguous()
         self.rays, self.samples = len(self.edges), self.edges.shape[1] - 1
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
-        self.workspaces: list[Workspace] = []
+        self.kept: list[tuple[Workspace, int]] = []  # of each part, with the number of samples in it
         # To the unit cube, or to the cube that the unit ball just holds (`geometry.contraction`).
         low, high = self.field.aabb
         side, shift = high - low, 0.0
@@ -152,23 +152,21 @@ class _Call:
         """Render, and keep what the backward pass needs."""
         weights = list(given)
         density, color = self.split(weights)
-        # A ray that ends early has no weights behind its end.
-        out = (torch.empty if self.keep else torch.zeros)(self.rays, self.samples), torch.zeros(self.rays, 3)
+        out = torch.zeros(self.rays, self.samples), torch.zeros(self.rays, 3)
         words = [words_of(sum(padded_widths(each)[:-1]), self.dtype) if each else 0 for each in (density, color)]
         space, grid, networks = self.space(origins, directions), self.grid(table), self.networks(weights, False)
-        limit = np.float32(self.whole_from if self.keep else self.opaque_below)
-        numbers = np.float32(self.field.bias), limit, self.closed, self.field.handed_over(features.shape[1])
+        limits = (np.float32(each) for each in (self.field.bias, self.whole_from, self.opaque_below))
+        numbers = *limits, self.closed, self.field.handed_over(features.shape[1])
         of_rays, shown = arrays_of((features.float(),))[0], arrays_of(out)
 
-        def keep(bounds: tuple[int, int]) -> Workspace:
+        def keep(bounds: tuple[int, int]) -> tuple[Workspace, int]:
             blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS)
             workspace = take_workspace(blocks * ROWS, (words[0], words[1]))
-            kept = workspace.arrays()[1:]
-            _forward(self.kind, *bounds, space, of_rays, grid, networks, numbers, kept, shown)
-            return workspace
+            given = space, of_rays, grid, networks, numbers, workspace.arrays(), shown
+            return workspace, _forward(self.kind, *bounds, *given)
 
         if self.keep:
-            self.workspaces = in_parallel(keep, self.parts)
+            self.kept = in_parallel(keep, self.parts)
         else:
             in_parallel(
                 lambda bounds: _show(self.kind, *bounds, space, of_rays, grid, networks, numbers, shown), self.parts
@@ -187,14 +185,14 @@ class _Call:
             weights: of both perceptrons.
             grads: of what `forward` returned.
         """
-        if not self.workspaces:
+        if not self.kept:
             raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
         density, color = self.split(weights)
         widths = padded_widths(density), padded_widths(color) if color else []
         counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
         sums = torch.zeros(len(self.parts), sum(counts))
-        found = len(self.field.layout.resolutions) * table.shape[1]
-        points, of_points = torch.empty(self.rays * self.samples, 3), torch.empty(self.rays * self.samples, found)
+        found, ends = len(self.field.layout.resolutions) * table.shape[1], np.cumsum([used for _, used in self.kept])
+        points, of_points = torch.empty(int(ends[-1]), 3), torch.empty(int(ends[-1]), found)
         of_rays = [torch.zeros(each.shape) for each in rays]
         space, grid, networks = self.space(*rays[:2]), self.grid(table), self.networks(weights, transposed=True)
         numbers = np.float32(self.field.least_slope), self.field.handed_over(rays[2].shape[1]), wants_rays
@@ -202,15 +200,16 @@ class _Call:
 
         def part(number: int) -> None:
             totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
-            kept = self.workspaces[number].arrays()[1:]
-            _backward(self.kind, *self.parts[number], space, grid, networks, numbers, of_light, kept, out, totals)
+            workspace, used = self.kept[number]
+            given = space, grid, networks, numbers, of_light, workspace.arrays(), out, totals
+            _backward(self.kind, *self.parts[number], ends[number] - used, used, *given)
 
         in_parallel(part, range(len(self.parts)))
         total = sums.sum(dim=0)
         of_weights = unpadded(total[: counts[0]], density, widths[0])
         of_weights += unpadded(total[counts[0] :], color, widths[1]) if color else []
-        give_back(self.workspaces)
-        self.workspaces = []
+        give_back([workspace for workspace, _ in self.kept])
+        self.kept = []
         of_rays[0] *= self.scale
         of_rays[1] *= self.scale
         return of_rays, points, of_points, of_weights
@@ -239,33 +238,27 @@ class _DenseRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _next_of_rays(first, samples, start, count, block):
-    # Which samples of which rays a block has: ray after ray.
-    r, k = first + start // samples, start % samples
-    for i in range(count):
-        block[0][i], block[1][i] = r, k
-        k += 1
-        if k == samples:
-            r, k = r + 1, 0
-
-
-@njit
-@no_type_check
-def _next_of_groups(first, last, samples, at, lights, block):
-    # The same, where rays lie beside each other: the samples of one number, of those that light still gets through to.
-    leftmost, k, c = at
-    count, width = 0, min(BESIDE, last - leftmost)
+def _next_samples(first, last, samples, order, at, lights, block):
+    # Fills a block, and returns how many samples it has, and where the next one begins. Rays take turns, and have so
+    # many samples in each; those that no light gets through to at its beginning have none.
+    beside, each = order
+    leftmost, begin, c, k = at
+    count, width = 0, min(beside, last - leftmost)
     while count < ROWS and leftmost < last:
-        r = leftmost + c
-        block[0][count], block[1][count] = r, k
-        count += lights[r - first] > ZERO
-        c += 1
+        r, end = leftmost + c, min(begin + each, samples)
+        if k == begin and lights[r - first] <= ZERO:
+            k = end
+        else:
+            block[0][count], block[1][count] = r, k
+            count, k = count + 1, k + 1
+        if k == end:
+            c, k = c + 1, begin
         if c == width:
-            c, k = 0, k + 1
-        if k == samples:
-            k, leftmost = 0, leftmost + BESIDE
-            width = min(BESIDE, last - leftmost)
-    return count, (leftmost, k, c)
+            c, begin, k = 0, end, end
+        if begin == samples:
+            leftmost, begin, k = leftmost + beside, 0, 0
+            width = min(beside, last - leftmost)
+    return count, (leftmost, begin, c, k)
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
@@ -339,35 +332,39 @@ def _new_block():
 def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call, kept, out):
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
-    bias, whole_from, closed, hidden = numbers_of_call
-    all_numbers, all_points, density_kept, color_kept = kept
+    bias, whole_from, opaque_below, closed, hidden = numbers_of_call
+    places, all_numbers, all_points, density_kept, color_kept = kept
     weights, foreground = out
-    samples, colored = space[2].shape[1] - 1, color_dims.shape[0] > 0
+    samples, colored, size = space[2].shape[1] - 1, color_dims.shape[0] > 0, bytes_of(kind)
     block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32)
-    lights = np.ones(last - first, np.float32)
+    lights, at, start = np.ones(last - first, np.float32), (first, 0, 0, 0), 0
     flat, outer = sums.reshape(-1), dims[-1]
-    stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
-    total = (last - first) * samples
-    for start in range(0, total, ROWS):
-        count = min(ROWS, total - start)
+    stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
+    while at[0] < last:
+        count, at = _next_samples(first, last, samples, IN_BATCHES, at, lights, block)
+        if count == 0:
+            break
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
-        _next_of_rays(first, samples, start, count, block)
+        for i in range(count):
+            places[start + i] = (block[0][i] - first) * samples + block[1][i]
         _place(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + start * stride, address(sums)
-        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
-        through(kind, x, stride, address(density_words), dims, y, y)
+        round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
+        through(kind, x, address(density_words), dims, y, y)
         absorb(count, flat, outer, bias, space[3], whole_from, block[3], block[2], points, numbers, rooms)
-        _composite(count, first, closed, ZERO, block, rooms[2], lights, numbers, weights)
+        _composite(count, first, closed, opaque_below, block, rooms[2], lights, numbers, weights)
         if colored:
             for i in range(count):
                 _color_inputs(i, block[0][i], hidden, flat, outer, of_rays, inputs, i)
             x = address(color_kept) + start * color_stride
-            round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
-            through(kind, x, color_stride, address(color_words), color_dims, y, y)
+            round_rows(kind, address(inputs), 4 * color_dims[0], x, size * color_dims[0], ROWS, color_dims[0])
+            through(kind, x, address(color_words), color_dims, y, y)
             shade(count, flat, color_dims[-1], block[0], numbers, rooms, foreground)
+        start += count
+    return start
 
 
 @njit
@@ -375,10 +372,9 @@ def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call,
 def _show_colors(kind, count, hues, color_words, color_dims, rooms, foreground):
     # Of samples that have waited: add their weighted colors to what their rays show.
     owners, inputs, numbers, words, sums = hues
-    stride = bytes_of(kind) * color_dims[:-1].sum()
     x, y = address(words), address(sums)
-    round_rows(kind, address(inputs), 4 * color_dims[0], x, stride, ROWS, color_dims[0])
-    through(kind, x, stride, address(color_words), color_dims, y, y)
+    round_rows(kind, address(inputs), 4 * color_dims[0], x, bytes_of(kind) * color_dims[0], ROWS, color_dims[0])
+    through(kind, x, address(color_words), color_dims, y, y)
     shade(count, sums.reshape(-1), color_dims[-1], owners, numbers, rooms, foreground)
 
 
@@ -389,13 +385,13 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
     # colors until there is a block of them.
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
-    bias, opaque_below, closed, hidden = numbers_of_call
+    bias, _, opaque_below, closed, hidden = numbers_of_call
     weights, foreground = out
     samples, colored, size = space[2].shape[1] - 1, color_dims.shape[0] > 0, bytes_of(kind)
     block, rooms, points = _new_block(), new_rooms(), np.zeros((ROWS, 3), np.float32)
     numbers, features = np.zeros((ROWS, NUMBERS), np.float32), np.zeros((ROWS, dims[0]), np.float32)
-    sums, stride = np.zeros((ROWS, dims.max()), np.float32), size * dims[:-1].sum()
-    words, lights = np.zeros(ROWS * stride // 4, np.int32), np.ones(last - first, np.float32)
+    sums, words = np.zeros((ROWS, dims.max()), np.float32), np.zeros(ROWS * size * dims[:-1].sum() // 4, np.int32)
+    lights = np.ones(last - first, np.float32)
     hues = (
         np.zeros(ROWS, np.int64),
         np.zeros((ROWS, color_dims[0] if colored else 0), np.float32),
@@ -403,14 +399,14 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
         np.zeros(ROWS * size * (color_dims[:-1].sum() if colored else 0) // 4, np.int32),
         np.zeros((ROWS, color_dims.max() if colored else 0), np.float32),
     )
-    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
+    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0, 0), 0
     while at[0] < last:
-        count, at = _next_of_groups(first, last, samples, at, lights, block)
+        count, at = _next_samples(first, last, samples, IN_PICTURES, at, lights, block)
         _place(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(words), address(sums)
-        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
-        through(kind, x, stride, address(density_words), dims, y, y)
+        round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
+        through(kind, x, address(density_words), dims, y, y)
         flat = sums.reshape(-1)
         absorb(count, flat, dims[-1], bias, space[3], ZERO, block[3], block[2], points, numbers, rooms)
         _composite(count, first, closed, opaque_below, block, rooms[2], lights, numbers, weights)
@@ -428,18 +424,14 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
 
 @njit
 @no_type_check
-def _composite_back(count, start, first, samples, colored, least_slope, grads, numbers, behind, outer, flat, raw):
-    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front. Returns
-    # what lies behind the first of these samples.
+def _composite_back(count, first, colored, least_slope, grads, block, numbers, behind, outer, flat, raw):
+    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front.
     of_weights, of_light = grads
     flat[: ROWS * outer] = ZERO
     raw[count:] = ZERO
-    last = start + count - 1
-    r, k = first + last // samples, last % samples
     for i in range(count - 1, -1, -1):
-        if k == samples - 1:
-            behind = ZERO
-        w, g = numbers[i, WEIGHT], of_weights[r, k]
+        r = block[0][i]
+        w, g = numbers[i, WEIGHT], of_weights[r, block[1][i]]
         for c in range(3 if colored else 0):
             shade, toward = numbers[i, COLOR + c], of_light[r, c] * w
             g += of_light[r, c] * shade
@@ -447,12 +439,8 @@ def _composite_back(count, start, first, samples, colored, least_slope, grads, n
             if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope * numbers[i, SHARE]
-        raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind)
-        behind += w * g
-        k -= 1
-        if k < 0:
-            r, k = r - 1, samples - 1
-    return behind
+        raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])
+        behind[r - first] += w * g
 
 
 @njit
@@ -493,11 +481,11 @@ def _move_rays(count, contracted, block, toward, of_origins, of_directions):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, kept, out, totals):
+def _backward(kind, first, last, begin, used, space, grid, networks, numbers_of_call, grads, kept, out, totals):
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
     least_slope, hidden, wants_rays = numbers_of_call
-    all_numbers, all_points, density_kept, color_kept = kept
+    places, all_numbers, all_points, density_kept, color_kept = kept
     points_out, of_points, of_origins, of_directions, of_rays = out
     of_density, of_color = totals
     size, samples, colored = bytes_of(kind), space[2].shape[1] - 1, color_dims.shape[0] > 0
@@ -510,27 +498,26 @@ def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, 
         np.zeros((ROWS, dims[0]), np.float32),
         np.zeros((ROWS, 3), np.float32),
     )
-    block, flat, next_room, outer, behind = _new_block(), sums.reshape(-1), size * ROWS * widest, dims[-1], ZERO
-    total, width = (last - first) * samples, of_points.shape[1]
-    for start in range((total - 1) // ROWS * ROWS, -1, -ROWS):
-        count, row = min(ROWS, total - start), first * samples + start
+    block, flat, next_room, outer = _new_block(), sums.reshape(-1), size * ROWS * widest, dims[-1]
+    behind, width = np.zeros(last - first, np.float32), of_points.shape[1]
+    for start in range((used - 1) // ROWS * ROWS, -1, -ROWS):
+        count, row = min(ROWS, used - start), begin + start
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
-        _next_of_rays(first, samples, start, count, block)
+        for i in range(count):
+            block[0][i], block[1][i] = first + places[start + i] // samples, places[start + i] % samples
         _place(space, count, block, points)
-        behind = _composite_back(
-            count, start, first, samples, colored, least_slope, grads, numbers, behind, color_outer, flat, raw
-        )
+        _composite_back(count, first, colored, least_slope, grads, block, numbers, behind, color_outer, flat, raw)
         y, dy = address(sums), address(words)
         if colored:
             round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
             back_through(
-                kind, address(color_kept) + start * color_stride, color_stride, address(color_words), color_dims, dy,
+                kind, address(color_kept) + start * color_stride, address(color_words), color_dims, dy,
                 y, dy + next_room, dy + 2 * next_room, address(of_color), True, address(passed),
             )  # fmt: skip
         _hand_back(count, hidden, block[0], passed, raw, outer, flat, of_rays)
         round_rows(kind, y, 4 * outer, dy, size * outer, ROWS, outer)
         back_through(
-            kind, address(density_kept) + start * stride, stride, address(density_words), dims, dy,
+            kind, address(density_kept) + start * stride, address(density_words), dims, dy,
             y, dy + next_room, dy + 2 * next_room, address(of_density), True, address(features),
         )  # fmt: skip
         for i in range(count):

@@ -269,7 +269,8 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     inputs = np.zeros((ROWS, color_dims[0]), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
     flat, given = sums.reshape(-1), hidden + directions.shape[1]
-    stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
+    size = bytes_of(kind)
+    stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
     live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
     while True:
         live, waiting = start(march, SLOTS, live, waiting, last, ray, sample_index, light)
@@ -283,16 +284,16 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
         owners[count:], points[count:] = -1, HALF
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + block * ROWS * stride, address(sums)
-        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
-        through(kind, x, stride, address(density_words), dims, y, y)
+        round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
+        through(kind, x, address(density_words), dims, y, y)
         absorb(count, flat, dims[-1], bias, False, ZERO, lengths, distances, points, numbers, rooms)
         asked += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
         for i in range(count):
             inputs[i, :hidden] = flat[i * dims[-1] : i * dims[-1] + hidden]
             inputs[i, hidden:given] = directions[ray[slots[i]]]
         x = address(color_kept) + block * ROWS * color_stride
-        round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
-        through(kind, x, color_stride, address(color_words), color_dims, y, y)
+        round_rows(kind, address(inputs), 4 * color_dims[0], x, size * color_dims[0], ROWS, color_dims[0])
+        through(kind, x, address(color_words), color_dims, y, y)
         shade(count, flat, color_dims[-1], owners, numbers, rooms, foreground)
         live = _end(live, end, opaque_below, ray, sample_index, light)
         block += 1
@@ -339,7 +340,7 @@ def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, f
         y, dy = address(sums), address(words)
         round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
         back_through(
-            kind, address(color_kept) + block * ROWS * color_stride, color_stride, address(color_words), color_dims, dy,
+            kind, address(color_kept) + block * ROWS * color_stride, address(color_words), color_dims, dy,
             y, dy + next_room, dy + 2 * next_room, address(of_color), True, address(passed),
         )  # fmt: skip
         for i in range(ROWS):
@@ -348,7 +349,7 @@ def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, f
             flat[i * outer] += raw[i]
         round_rows(kind, y, 4 * outer, dy, size * outer, ROWS, outer)
         back_through(
-            kind, address(density_kept) + block * ROWS * stride, stride, address(density_words), dims, dy,
+            kind, address(density_kept) + block * ROWS * stride, address(density_words), dims, dy,
             y, dy + next_room, dy + 2 * next_room, address(of_density), True,
             address(features) + 4 * block * ROWS * dims[0],
         )  # fmt: skip

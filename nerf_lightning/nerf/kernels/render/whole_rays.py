@@ -140,7 +140,7 @@ def render_dense_rays(
         matmul_precision: the precision of the field's products.
         closed: whether the last interval takes all the light that is left.
         whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
-        opaque_below: in rendering, a sample behind which less light is left takes all of it, and ends the ray; 0: none.
+        opaque_below: a sample behind which less light is left takes all of it, and ends its ray; 0: none does.
     """
     kernels: Any = cpu_backend(DENSE, rays.near.device)
     return kernels.render(rays, edges, field, _dtype(matmul_precision), closed, whole_from, opaque_below)
