@@ -1,8 +1,8 @@
 """Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
 
-Some rays take turns with their samples, from front to back, and blocks of ROWS samples go from positions to light while
-they are in the cache. The way back takes the blocks from the last to the first, so that of each ray those samples come
-first that lie farthest, and sums up what lies behind each.
+Some rays go forward together, and blocks of ROWS samples go from positions to light while they are in the cache. The
+way back takes the blocks from the last to the first, so that of each ray those samples come first that lie farthest,
+and sums up what lies behind each.
 
 Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
 """
@@ -43,9 +43,8 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
-IN_PICTURES, IN_BATCHES = (64, 1), (32, 8)
-"""So many rays take turns, with so many samples each: a ray that has become opaque takes no further turn. Rays of a
-picture are neighbors, and share the grid's cells; of a batch's rays only the samples of one ray do."""
+ABREAST = 128
+"""So many rays go forward together, a sample each, until they are opaque; those of a picture share the grid's cells."""
 LEAST_WEIGHT = np.float32(1e-4)
 """Where rays may end early, samples of less weight have no color."""
 COPY = np.float32(0)
@@ -238,27 +237,22 @@ class _DenseRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _next_samples(first, last, samples, order, at, lights, block):
-    # Fills a block, and returns how many samples it has, and where the next one begins. Rays take turns, and have so
-    # many samples in each; those that no light gets through to at its beginning have none.
-    beside, each = order
-    leftmost, begin, c, k = at
-    count, width = 0, min(beside, last - leftmost)
+def _next_samples(first, last, samples, at, lights, block):
+    # Fills a block, and returns how many samples it has, and where the next one begins. Of the rays that go forward
+    # together come the first samples, the second ones, and so on, as far as light gets through.
+    leftmost, k, c = at
+    count, width = 0, min(ABREAST, last - leftmost)
     while count < ROWS and leftmost < last:
-        r, end = leftmost + c, min(begin + each, samples)
-        if k == begin and lights[r - first] <= ZERO:
-            k = end
-        else:
-            block[0][count], block[1][count] = r, k
-            count, k = count + 1, k + 1
-        if k == end:
-            c, k = c + 1, begin
+        r = leftmost + c
+        block[0][count], block[1][count] = r, k
+        count += lights[r - first] > ZERO
+        c += 1
         if c == width:
-            c, begin, k = 0, end, end
-        if begin == samples:
-            leftmost, begin, k = leftmost + beside, 0, 0
-            width = min(beside, last - leftmost)
-    return count, (leftmost, begin, c, k)
+            c, k = 0, k + 1
+        if k == samples:
+            k, leftmost = 0, leftmost + ABREAST
+            width = min(ABREAST, last - leftmost)
+    return count, (leftmost, k, c)
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
@@ -339,11 +333,11 @@ def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call,
     block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32)
-    lights, at, start = np.ones(last - first, np.float32), (first, 0, 0, 0), 0
+    lights, at, start = np.ones(last - first, np.float32), (first, 0, 0), 0
     flat, outer = sums.reshape(-1), dims[-1]
     stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
     while at[0] < last:
-        count, at = _next_samples(first, last, samples, IN_BATCHES, at, lights, block)
+        count, at = _next_samples(first, last, samples, at, lights, block)
         if count == 0:
             break
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
@@ -399,9 +393,9 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
         np.zeros(ROWS * size * (color_dims[:-1].sum() if colored else 0) // 4, np.int32),
         np.zeros((ROWS, color_dims.max() if colored else 0), np.float32),
     )
-    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0, 0), 0
+    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
     while at[0] < last:
-        count, at = _next_samples(first, last, samples, IN_PICTURES, at, lights, block)
+        count, at = _next_samples(first, last, samples, at, lights, block)
         _place(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(words), address(sums)
