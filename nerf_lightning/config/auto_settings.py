@@ -74,18 +74,9 @@ def resolve_auto(
         seconds = PHOTOS_SECONDS if of_photos else None
     if choices.get("model") == AUTO:
         on_gpu = _on_gpu(overrides, on_gpu, former)
-        name, reason = model_for(scene)
-        if on_gpu and name == IN_A_BOX and grid_for(scene) >= LARGE_CELLS:
-            name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"
-        log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
-        with_model = [*overrides, f"model={name}"]
-        if name == PHOTOGRAPHS:
-            short = SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS
-            with_model += _for_photographs(scene, overrides, seconds is not None and seconds < short)
-        with_model += _for_gpu(name, overrides) if on_gpu else []
-        fitted, picked = compose_config("train", with_model)
+        fitted, choices = compose_config("train", [*overrides, *model_overrides(overrides, scene, on_gpu, seconds)])
         fitted.paths = config.paths
-        config, choices = fitted, picked
+        config = fitted
     _settle(config, "doctor", of_photos)
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
@@ -93,6 +84,26 @@ def resolve_auto(
         if of_photos:
             log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
     return config, chosen(choices)
+
+
+def model_overrides(overrides: Sequence[str], scene: Scene, on_gpu: bool, seconds: float | None) -> list[str]:
+    """Return what model=auto means for a scene, as overrides, and say so; what a person has typed stays.
+
+    Args:
+        overrides: what was typed.
+        scene: what is learned.
+        on_gpu: whether there is a GPU.
+        seconds: of training; None: nobody has said.
+    """
+    name, reason = model_for(scene)
+    if on_gpu and name == IN_A_BOX and grid_for(scene) >= LARGE_CELLS:
+        name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"
+    log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
+    suited = [f"model={name}"]
+    if name == PHOTOGRAPHS:
+        short = SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS
+        suited += _for_photographs(scene, overrides, seconds is not None and seconds < short)
+    return suited + (_for_gpu(name, overrides) if on_gpu else [])
 
 
 def _on_gpu(overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-LARGE = 1 << 20
+LARGE = 1 << 19
 
 
 class StepGuard:

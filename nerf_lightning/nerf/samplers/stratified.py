@@ -1,8 +1,13 @@
 """Stratified samples between near and far (Eq. 2, arXiv 2003.08934)."""
 
+from typing import Any
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
@@ -34,17 +39,40 @@ class StratifiedSampler(DenseSampler):
 
     def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
         """Return `num_samples` intervals from near to far."""
-        s = torch.linspace(0.0, 1.0, self.num_samples + 1, device=rays.near.device)
-        s = s.expand(*rays.near.shape, -1)
+        shares, jitter = torch.linspace(0.0, 1.0, self.num_samples + 1, device=rays.near.device), None
         if random is not None:
-            jitter = random.uniform("stratified", self.num_samples - 1) - 0.5
-            s = torch.cat([s[..., :1], s[..., 1:-1] + jitter / self.num_samples, s[..., -1:]], dim=-1)
-        near, far = rays.near[..., None], rays.far[..., None]
-        if self.contracted.is_on():
-            low, high = normalized_distance(near), normalized_distance(far)
-            return RaySamples(edges=from_normalized_distance(low + s * (high - low)), contracted_spacing=True)
-        return RaySamples(edges=near + s * (far - near))
+            jitter = (random.uniform("stratified", self.num_samples - 1) - 0.5) / self.num_samples
+        contracted, low, high = self.contracted.is_on(), rays.near, rays.far
+        if contracted:
+            low, high = normalized_distance(low), normalized_distance(high)
+        return RaySamples(stratified_edges(shares, jitter, low, high, contracted), contracted)
 
     def num_samples_after(self, before: int) -> int:
         """Always `num_samples`."""
         return self.num_samples
+
+
+def stratified_edges(
+    shares: Float[Tensor, "edges"],
+    jitter: Float[Tensor, "*rays inner"] | None,
+    low: Float[Tensor, "*rays"],
+    high: Float[Tensor, "*rays"],
+    contracted: bool,
+) -> Float[Tensor, "*rays edges"]:
+    """Return the fenceposts low + shares (high - low); contracted: the distances of which these are normalized ones.
+
+    Args:
+        shares: from 0 to 1.
+        jitter: added to each ray's inner shares; None: nothing.
+        low: where each ray begins.
+        high: where each ray ends.
+        contracted: whether `low` and `high` are normalized distances.
+    """
+    kernels: Any = cpu_backend("histograms.cpu", low.device) if low.dim() == 1 and low.dtype == torch.float32 else None
+    if kernels is not None and not (low.requires_grad or high.requires_grad):
+        return kernels.stratified(shares, jitter, low, high, contracted)
+    s = shares.expand(*low.shape, -1)
+    if jitter is not None:
+        s = torch.cat([s[..., :1], s[..., 1:-1] + jitter, s[..., -1:]], dim=-1)
+    edges = low[..., None] + s * (high - low)[..., None]
+    return from_normalized_distance(edges) if contracted else edges

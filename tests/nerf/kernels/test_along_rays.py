@@ -10,6 +10,7 @@ from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponential
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
 from nerf_lightning.nerf.randomness import batch_random, fold, permute
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
+from nerf_lightning.nerf.samplers.stratified import stratified_edges
 from nerf_lightning.nerf.types.rays import RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -50,6 +51,17 @@ def test_samples_come_from_where_the_histogram_says(floor, contracted):
     ours, plain = both(lambda: sample_histogram(edges[1:], weights[1:], u[1:], floor, contracted))
     torch.testing.assert_close(ours, plain, atol=2e-5, rtol=1e-4)
     assert bool((ours.diff(dim=-1) >= 0).all())
+
+
+@pytest.mark.parametrize("jittered", [False, True])
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.1, 0.999999)])
+@pytest.mark.parametrize("contracted", [False, True])
+def test_strata_are_the_same_to_the_bit(jittered, low, high, contracted):
+    jitter = (torch.rand(300, 6) - 0.5) / 7 if jittered else None
+    ends = torch.full((300,), low), torch.full((300,), high) - 0.05 * torch.arange(300) / 300
+    ours, plain = both(lambda: stratified_edges(torch.linspace(0, 1, 8), jitter, *ends, contracted))
+    assert torch.equal(ours, plain)
+    assert bool((ours.diff(dim=-1) > 0).all())
 
 
 def a_rendering(edges, weights, contracted=False):

@@ -13,14 +13,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
+from nerf_lightning.commands.train_job.build import searchpath_override
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
+from nerf_lightning.config.auto_settings import AUTO, model_overrides, takes_distances
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.extensions.bench.kernels import compared_kernels
 from nerf_lightning.extensions.bench.prepared import Bench, prepare
 from nerf_lightning.extensions.bench.stages import (
@@ -33,6 +38,7 @@ from nerf_lightning.extensions.bench.stages import (
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
+from nerf_lightning.nerf.types.scene import Scene
 
 Work = Callable[[], Any]
 Rows = dict[str, Float[np.ndarray, "rounds"]]
@@ -40,7 +46,8 @@ Rows = dict[str, Float[np.ndarray, "rounds"]]
 
 def run(config: DictConfig) -> float:
     """Measure, print a table, write bench.json; return training rays per second."""
-    bench = prepare(config, build(config.scene).read())
+    scene = build(config.scene).read()
+    bench = prepare(*_settled(config, scene))
     for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
         bench.take_step()
     bench.train(config.steps)
@@ -65,6 +72,19 @@ def run(config: DictConfig) -> float:
     write_json(folder / "bench.json", result)
     say(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])
+
+
+def _settled(config: DictConfig, scene: Scene) -> tuple[DictConfig, Scene]:
+    """Return config and scene with what model=auto chooses for it."""
+    hydra = HydraConfig.get()
+    choices, overrides = hydra.runtime.choices, [*searchpath_override(), *hydra.overrides.task]
+    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
+    if choices.get("model") != AUTO:
+        return config, scene
+    on_gpu = build(config.trainer).device_type == "cuda"
+    settled, _ = compose_config("bench", [*overrides, *model_overrides(overrides, scene, on_gpu, seconds=None)])
+    settled.paths = config.paths
+    return settled, scene
 
 
 def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:

@@ -27,3 +27,14 @@ def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
 
 def test_a_group_of_training_is_told_where_it_belongs(nerf):
     said(nerf("bench", "experiment=quickstart"), "nerf bench has no setting experiment. It belongs to training")
+
+
+def test_bench_measures_what_training_would_choose(nerf, tmp_path):
+    result = nerf(
+        "bench", "model=auto", "scene.resolution=16", "scene.num_train=4", "scene.num_val=1",
+        "scene.num_test=1", f"scene.cache_dir={tmp_path}/cache", "rounds=1", "render_rays=64", "scaling=false",
+        "data.batch_rays=128", "data.sample_budget=2048", f"paths.output_dir={tmp_path}/bench",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    assert "model: fast, because the scene is in a box" in result.err
+    assert json.loads((tmp_path / "bench" / "bench.json").read_text())["batch_rays"] == 128

@@ -34,6 +34,20 @@ def sample(
     return out
 
 
+def stratified(
+    shares: Float[Tensor, "edges"],
+    jitter: Float[Tensor, "rays inner"] | None,
+    low: Float[Tensor, "rays"],
+    high: Float[Tensor, "rays"],
+    contracted: bool,
+) -> Float[Tensor, "rays edges"]:
+    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
+    out, shift = torch.empty(len(low), len(shares)), torch.empty(len(low), 0) if jitter is None else jitter
+    arrays = (each.contiguous().numpy() for each in (shares, shift, low, high))
+    over_rows(_stratified, len(low), *arrays, contracted, out.numpy())
+    return out
+
+
 def interlevel(
     t: Float[Tensor, "rays edges"],
     w: Float[Tensor, "rays samples"],
@@ -55,6 +69,7 @@ def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]]), torch.ones(1, 2)
     sample(edges, weights, torch.tensor([[0.5]]), 0.01, True)
+    stratified(edges[0], torch.zeros(1, 1), edges[:, 0], edges[:, 2], True)
     interlevel(edges, weights, edges, weights)
     distortion(edges, weights, True)
 
@@ -75,6 +90,28 @@ def _spaced(distance, contracted):
     return HALF * distance if distance < ONE else ONE - HALF / distance
 
 
+@njit
+@no_type_check
+def _distance(spaced, contracted):
+    # Back again: `geometry.contraction.from_normalized_distance`.
+    if not contracted:
+        return spaced
+    return TWO * spaced if spaced < HALF else HALF / max(ONE - spaced, LEAST_LEFT)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+@no_type_check
+def _stratified(first, last, shares, shift, low, high, contracted, out):
+    end, shifted = len(shares) - 1, shift.shape[1] > 0
+    for r in range(first, last):
+        span = high[r] - low[r]
+        for k in range(end + 1):
+            share = shares[k]
+            if shifted and 0 < k < end:
+                share += shift[r, k - 1]
+            out[r, k] = _distance(low[r] + share * span, contracted)
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _sample(first, last, edges, weights, u, floor, contracted, out):
@@ -91,10 +128,7 @@ def _sample(first, last, edges, weights, u, floor, contracted, out):
             span = above - below
             part = min(max((u[r, k] - below) / span, ZERO), ONE) if span > ZERO else HALF
             left, right = _spaced(edges[r, i], contracted), _spaced(edges[r, i + 1], contracted)
-            at = left + part * (right - left)
-            if contracted:  # back again: `from_normalized_distance`
-                at = TWO * at if at < HALF else HALF / max(ONE - at, LEAST_LEFT)
-            out[r, k] = at
+            out[r, k] = _distance(left + part * (right - left), contracted)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
