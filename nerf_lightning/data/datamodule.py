@@ -13,6 +13,7 @@ from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_dev
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, WholeViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.kernels.threads import num_threads
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
@@ -40,8 +41,8 @@ class RayDataModule(LightningDataModule):
         val_rays: size of the validation subset.
         device_budget: gigabytes of GPU memory for pixels. If they fit, they are moved there and batches are made there;
             0 keeps them on the host, auto is half of the free memory.
-        prefetch: make the next batch in a background thread while a step runs; auto: if the pixels are on the host and
-            the model on a GPU, or if a mapped file exceeds the memory. The batches are the same.
+        prefetch: make the next batch in a background thread while a step runs; auto: if there is a core or a GPU to run
+            both, or if a mapped file exceeds the memory. The batches are the same.
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
         overfit_views: train on this number of photographs, spread over all, without jitter, and validate on them, to
             check that a model can overfit; None: train on all.
@@ -114,7 +115,7 @@ class RayDataModule(LightningDataModule):
             self.batches.take_from(on_device(self.scene, device))
             return
         from_disk = num_bytes(self.scene.pixels) > free_memory()
-        helps = device.type != "cpu" or from_disk
+        helps = device.type != "cpu" or from_disk or num_threads() > 1
         self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
 
     def fits(self, device: torch.device) -> bool:

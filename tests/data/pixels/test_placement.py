@@ -130,18 +130,20 @@ def test_the_budget_decides(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("prefetch", "kind", "available", "expected"),
+    ("prefetch", "kind", "available", "threads", "expected"),
     [
-        ("auto", "cpu", 10**9, None),
-        ("auto", "cpu", 1000, "cpu"),
-        ("auto", "cuda", 10**9, "cuda"),
-        (False, "cuda", 1000, None),
-        (True, "cpu", 10**9, "cpu"),
+        ("auto", "cpu", 10**9, 1, None),
+        ("auto", "cpu", 10**9, 2, "cpu"),
+        ("auto", "cpu", 1000, 1, "cpu"),
+        ("auto", "cuda", 10**9, 1, "cuda"),
+        (False, "cuda", 1000, 2, None),
+        (True, "cpu", 10**9, 1, "cpu"),
     ],
 )
-def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, expected):
+def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, threads, expected):
     data = RayDataModule(ball_scene(), Progress(), seed=0, device_budget=0, prefetch=prefetch)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
+    monkeypatch.setattr(datamodule, "num_threads", lambda: threads)
     data.settle(torch.device(kind))
     assert data.batches.prefetch_for == (None if expected is None else torch.device(expected))
     assert data.batches.scene is data.scene
