@@ -13,7 +13,6 @@ from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_dev
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, WholeViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.kernels.threads import num_threads
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
@@ -115,7 +114,7 @@ class RayDataModule(LightningDataModule):
             self.batches.take_from(on_device(self.scene, device))
             return
         from_disk = num_bytes(self.scene.pixels) > free_memory()
-        helps = device.type != "cpu" or from_disk or num_threads() > 1
+        helps = device.type != "cpu" or from_disk or torch.get_num_threads() > 1
         self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
 
     def fits(self, device: torch.device) -> bool:

@@ -143,7 +143,7 @@ def test_the_budget_decides(monkeypatch):
 def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, threads, expected):
     data = RayDataModule(ball_scene(), Progress(), seed=0, device_budget=0, prefetch=prefetch)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
-    monkeypatch.setattr(datamodule, "num_threads", lambda: threads)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     data.settle(torch.device(kind))
     assert data.batches.prefetch_for == (None if expected is None else torch.device(expected))
     assert data.batches.scene is data.scene
