@@ -86,7 +86,7 @@ def resolve_auto(
     return config, chosen(choices)
 
 
-def model_overrides(overrides: Sequence[str], scene: Scene, on_gpu: bool, seconds: float | None) -> list[str]:
+def model_overrides(overrides: Sequence[str], scene: Scene, on_gpu: bool, seconds: int | float | None) -> list[str]:
     """Return what model=auto means for a scene, as overrides, and say so; what a person has typed stays.
 
     Args:
