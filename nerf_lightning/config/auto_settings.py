@@ -72,11 +72,7 @@ def resolve_auto(
     seconds = config.budget.seconds
     if seconds == AUTO:
         seconds = PHOTOS_SECONDS if of_photos else None
-    if choices.get("model") == AUTO:
-        on_gpu = _on_gpu(overrides, on_gpu, former)
-        fitted, choices = compose_config("train", [*overrides, *model_overrides(overrides, scene, on_gpu, seconds)])
-        fitted.paths = config.paths
-        config = fitted
+    config, choices = fit_model("train", config, choices, overrides, scene, _on_gpu(overrides, on_gpu, former), seconds)
     _settle(config, "doctor", of_photos)
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
@@ -86,15 +82,28 @@ def resolve_auto(
     return config, chosen(choices)
 
 
-def model_overrides(overrides: Sequence[str], scene: Scene, on_gpu: bool, seconds: int | float | None) -> list[str]:
-    """Return what model=auto means for a scene, as overrides, and say so; what a person has typed stays.
+def fit_model(
+    command: str,
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    scene: Scene,
+    on_gpu: bool,
+    seconds: int | float | None = None,
+) -> tuple[DictConfig, Mapping[str, Any]]:
+    """Return a command's config with what model=auto means for a scene, if it was chosen, and the names picked.
 
-    Args:
-        overrides: what was typed.
-        scene: what is learned.
-        on_gpu: whether there is a GPU.
-        seconds: of training; None: nobody has said.
+    `seconds` of training; None: nobody has said. What a person has typed stays.
     """
+    if choices.get("model") != AUTO:
+        return config, choices
+    fitted, picked = compose_config(command, [*overrides, *_for_scene(scene, overrides, on_gpu, seconds)])
+    fitted.paths = config.paths
+    return fitted, picked
+
+
+def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
+    """Return the model that suits a scene, with what suits the model, and say so."""
     name, reason = model_for(scene)
     if on_gpu and name == IN_A_BOX and grid_for(scene) >= LARGE_CELLS:
         name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"

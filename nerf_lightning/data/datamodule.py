@@ -40,8 +40,8 @@ class RayDataModule(LightningDataModule):
         val_rays: size of the validation subset.
         device_budget: gigabytes of GPU memory for pixels. If they fit, they are moved there and batches are made there;
             0 keeps them on the host, auto is half of the free memory.
-        prefetch: make the next batch in a background thread while a step runs; auto: if there is a core or a GPU to run
-            both, or if a mapped file exceeds the memory. The batches are the same.
+        prefetch: make the next batch in a background thread while a step runs; auto: if several cores or a GPU can do
+            both at once, or if a mapped file exceeds the memory. The batches are the same.
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
         overfit_views: train on this number of photographs, spread over all, without jitter, and validate on them, to
             check that a model can overfit; None: train on all.

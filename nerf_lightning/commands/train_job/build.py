@@ -51,11 +51,8 @@ class TrainJob(Run):
 
 def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config asks for, and read its scene if none is given; nothing is written."""
-    hydra = HydraConfig.get()
-    # What is left open is composed again, and may lie where the command line has said.
-    overrides = [*searchpath_override(), *hydra.overrides.task]
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
-    return assemble_job(asked, hydra.runtime.choices, overrides, former, scene)
+    return assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
 
 
 def assemble_job(
@@ -104,6 +101,11 @@ def assemble_job(
         loggers=loggers,
         post_training=post_training,
     )
+
+
+def typed_overrides() -> list[str]:
+    """Return what this command's config was composed with: what is left open is composed again with it."""
+    return [*searchpath_override(), *HydraConfig.get().overrides.task]
 
 
 def searchpath_override() -> list[str]:

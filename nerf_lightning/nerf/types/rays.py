@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
@@ -41,7 +42,8 @@ class RayBundle(TensorStruct):
             return column.unflatten(0, (-1, count)).mean(dim=1) if column.is_floating_point() else column[::count]
 
         rays = replace(self, together=1).map(middle)
-        return replace(rays, directions=torch.nn.functional.normalize(rays.directions, dim=-1))
+        along, seen = (functional.normalize(each, dim=-1) for each in (rays.directions, rays.view_directions))
+        return replace(rays, directions=along, view_directions=seen)
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,10 @@ from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
-from nerf_lightning.commands.train_job.build import searchpath_override
+from nerf_lightning.commands.train_job.build import typed_overrides
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
-from nerf_lightning.config.auto_settings import AUTO, model_overrides, takes_distances
-from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.auto_settings import fit_model, takes_distances
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.extensions.bench.kernels import compared_kernels
@@ -76,15 +75,10 @@ def run(config: DictConfig) -> float:
 
 def _settled(config: DictConfig, scene: Scene) -> tuple[DictConfig, Scene]:
     """Return config and scene with what model=auto chooses for it."""
-    hydra = HydraConfig.get()
-    choices, overrides = hydra.runtime.choices, [*searchpath_override(), *hydra.overrides.task]
+    choices, overrides = HydraConfig.get().runtime.choices, typed_overrides()
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
-    if choices.get("model") != AUTO:
-        return config, scene
     on_gpu = build(config.trainer).device_type == "cuda"
-    settled, _ = compose_config("bench", [*overrides, *model_overrides(overrides, scene, on_gpu, seconds=None)])
-    settled.paths = config.paths
-    return settled, scene
+    return fit_model("bench", config, choices, overrides, scene, on_gpu)[0], scene
 
 
 def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:

@@ -274,8 +274,8 @@ def _turn(source, rows, width, target):
 def through(kind, x, w, dims, y, into):
     """Send ROWS rows through all layers, and the end to `into`; at x there is room for all layers' inputs.
 
-    ROWS rows of the first layer's, which are there, those of the second, and so on: memory is written from its
-    beginning to its end, where rows of all layers, with gaps in each, took twice as long.
+    First come all rows of the first layer's inputs, which are there, then those of the second's, and so on: so memory
+    is written from its beginning to its end.
     """
     layers, size = len(dims) - 1, bytes_of(kind)
     open_tiles(kind)

@@ -147,29 +147,26 @@ class _Call:
         """Return what looks features up."""
         return arrays_of((table,))[0], *level_arrays(self.field.layout), (0,) * table.shape[1]
 
-    def forward(self, origins: Tensor, directions: Tensor, features: Tensor, table: Tensor, *given: Tensor) -> Any:
+    def forward(self, origins: Tensor, directions: Tensor, features: Tensor, table: Tensor, *learnt: Tensor) -> Any:
         """Render, and keep what the backward pass needs."""
-        weights = list(given)
+        weights = list(learnt)
         density, color = self.split(weights)
         out = torch.zeros(self.rays, self.samples), torch.zeros(self.rays, 3)
         words = [words_of(sum(padded_widths(each)[:-1]), self.dtype) if each else 0 for each in (density, color)]
         space, grid, networks = self.space(origins, directions), self.grid(table), self.networks(weights, False)
         limits = (np.float32(each) for each in (self.field.bias, self.whole_from, self.opaque_below))
         numbers = *limits, self.closed, self.field.handed_over(features.shape[1])
-        of_rays, shown = arrays_of((features.float(),))[0], arrays_of(out)
+        given, shown = (space, arrays_of((features.float(),))[0], grid, networks, numbers), arrays_of(out)
 
         def keep(bounds: tuple[int, int]) -> tuple[Workspace, int]:
             blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS)
             workspace = take_workspace(blocks * ROWS, (words[0], words[1]))
-            given = space, of_rays, grid, networks, numbers, workspace.arrays(), shown
-            return workspace, _forward(self.kind, *bounds, *given)
+            return workspace, _forward(self.kind, *bounds, *given, workspace.arrays(), shown)
 
         if self.keep:
             self.kept = in_parallel(keep, self.parts)
         else:
-            in_parallel(
-                lambda bounds: _show(self.kind, *bounds, space, of_rays, grid, networks, numbers, shown), self.parts
-            )
+            in_parallel(lambda bounds: _show(self.kind, *bounds, *given, shown), self.parts)
         return out
 
     def backward(
@@ -396,6 +393,8 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
     least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
     while at[0] < last:
         count, at = _next_samples(first, last, samples, at, lights, block)
+        if count == 0:
+            break
         _place(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(words), address(sums)

@@ -128,8 +128,8 @@ def render_dense_rays(
     field: FieldParts,
     matmul_precision: MatmulPrecision,
     closed: bool,
-    whole_from: float = 0.0,
-    opaque_below: float = 0.0,
+    whole_from: float,
+    opaque_below: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
     """Render rays with the kernel that `has_dense_kernel` found; return all weights, and sums of weights times color.
 

@@ -19,7 +19,8 @@ class Workspace:
     """What the forward pass leaves behind of some samples."""
 
     owners: Tensor
-    """Number of each sample's ray; negative: none."""
+    """Number of each sample's ray; negative: none. Of rays with equally many samples the number of the sample among
+    those of all rays."""
     numbers: Tensor
     points: Tensor
     """In the unit cube."""
