@@ -11,7 +11,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.compute import devices
-from nerf_lightning.config.auto_settings import GPU_BATCHES, resolve_auto, resolve_correction
+from nerf_lightning.config.auto_settings import GPU_BATCHES, NUM_STEPS, resolve_auto, resolve_correction
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
@@ -32,7 +32,7 @@ def chosen_for(scene, *overrides):
 
 @pytest.mark.parametrize(
     ("scene", "model", "batch_rays"),
-    [(IN_A_BOX, "fast", 8192), (PHOTOGRAPHS, "fast_proposal", 2048), (FORWARD_FACING, "fast_proposal", 2048)],
+    [(IN_A_BOX, "fast", 32768), (PHOTOGRAPHS, "fast_proposal", 2048), (FORWARD_FACING, "fast_proposal", 2048)],
 )
 def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_rays):
     caplog.set_level("INFO")
@@ -73,6 +73,24 @@ def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
     job = assemble_job(*compose_config("train", overrides), overrides)
     assert job.settings.device_type == "cuda"
     assert job.data.batches.batch_rays == GPU_BATCHES["fast"]["data.batch_rays"]
+
+
+@pytest.mark.parametrize(
+    ("scene", "overrides", "suited"),
+    [
+        (LARGE_PICTURES, (), (576, 1024, 19, 2)),
+        (LARGE_PICTURES, ("budget.seconds=60",), (576, 512, 18, 1)),
+        (LARGE_PICTURES, (f"{NUM_STEPS}=100", "encoder=hash_grid_small", "field.color_layers=3"), (100, 256, 16, 3)),
+        (IN_A_BOX, (), (384, 512, 18, 1)),
+    ],
+)
+def test_large_pictures_of_a_box_take_finer_steps_and_with_time_a_larger_model(caplog, scene, overrides, suited):
+    caplog.set_level("INFO")
+    config, _ = chosen_for(scene, *overrides)
+    grid = config.encoder.max_resolution, config.encoder.log2_table_size
+    assert (config.model.levels.fine.sampler.num_steps, *grid, config.field.color_layers) == suited
+    assert ("steps: 576 across the box" in caplog.text) == (suited[0] == 576)
+    assert ("encoder: 1024 cells per side, because" in caplog.text) == (suited[1] == 1024)
 
 
 def with_depths(scene, distance=1.0):

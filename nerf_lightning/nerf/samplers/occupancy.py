@@ -53,7 +53,7 @@ class OccupancySampler(RaggedSampler):
         warmup_steps: steps in which each update evaluates every cell; later, every other cell.
         prune_after: steps before any cell is pruned; larger if the background is baked into the images, so that dark
             content is not lost before it is learned.
-        decay: decay rate of the running density, per update.
+        decay: decay rate of the running density, per update; the larger, the later empty cells are pruned.
         min_alpha: minimum opacity of an occupied interval.
         opaque_below: samples end where the transmittance falls below this; 0 keeps all.
         capacity: size of the arrays of samples on GPUs, where no size is read on the host; samples that do not fit are
@@ -67,8 +67,8 @@ class OccupancySampler(RaggedSampler):
         update_every: int = 16,
         warmup_steps: int = 256,
         prune_after: int = 0,
-        decay: float = 0.95,
-        min_alpha: float = 0.001,
+        decay: float = 0.8,
+        min_alpha: float = 0.01,
         opaque_below: float = 1e-3,
         capacity: int | None = None,
     ):
