@@ -32,8 +32,9 @@ TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and 32.09 dB with 1024 and 2^18.
 """
 
-NUM_STEPS = "model.levels.fine.sampler.num_steps"
-GRID = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
+STEPS_SETTING = "model.levels.fine.sampler.num_steps"
+GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
+"""Who has typed one of them has chosen the grid."""
 LARGE, LARGE_CELLS = "fast_large", 1024
 """The model of a scene in a box on a GPU, whose pixels are as small as the cells of so fine a grid, or smaller."""
 LARGE_STEPS, LARGE_TABLE = 576, 19
@@ -137,10 +138,10 @@ def _on_gpu(overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | 
 def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
     """Return the steps, grid and layers that suit large pictures of a scene in a box; what a person has typed stays."""
     typed, suited = set(map(key_of, overrides)), []
-    if NUM_STEPS not in typed:
-        log.info("steps: %d across the box, because the pictures are large (%s=N)", LARGE_STEPS, NUM_STEPS)
-        suited.append(f"{NUM_STEPS}={LARGE_STEPS}")
-    if not short and not typed & GRID:
+    if STEPS_SETTING not in typed:
+        log.info("steps: %d across the box, because the pictures are large (%s=N)", LARGE_STEPS, STEPS_SETTING)
+        suited.append(f"{STEPS_SETTING}={LARGE_STEPS}")
+    if not short and not typed & GRID_SETTINGS:
         suited += _grid(LARGE_CELLS, LARGE_TABLE, "because the pictures are large")
     if not short and not typed & {"field", "field.color_layers"}:
         log.info("field: ngp, because the pictures are large (field=ngp_fast has one color layer fewer)")
@@ -168,7 +169,7 @@ def _for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> lis
     typed = set(map(key_of, overrides))
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
     suited = []
-    if not typed & GRID:
+    if not typed & GRID_SETTINGS:
         pixels = grid_for(scene)
         resolution = max(pixels // 2, 512) if short or few else pixels
         table = 18 if short else TABLE_SIZES[resolution]

@@ -11,7 +11,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.compute import devices
-from nerf_lightning.config.auto_settings import GPU_BATCHES, NUM_STEPS, resolve_auto, resolve_correction
+from nerf_lightning.config.auto_settings import GPU_BATCHES, STEPS_SETTING, resolve_auto, resolve_correction
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
@@ -80,7 +80,11 @@ def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
     [
         (LARGE_PICTURES, (), (576, 1024, 19, 2)),
         (LARGE_PICTURES, ("budget.seconds=60",), (576, 512, 18, 1)),
-        (LARGE_PICTURES, (f"{NUM_STEPS}=100", "encoder=hash_grid_small", "field.color_layers=3"), (100, 256, 16, 3)),
+        (
+            LARGE_PICTURES,
+            (f"{STEPS_SETTING}=100", "encoder=hash_grid_small", "field.color_layers=3"),
+            (100, 256, 16, 3),
+        ),
         (IN_A_BOX, (), (384, 512, 18, 1)),
     ],
 )
