@@ -46,5 +46,5 @@ def train(config: DictConfig, scene: Scene | None = None) -> Trained:
         folder.trained(job.clock.seconds)
         psnr = job.post_training(job.settings, job.scene, job.system.model, trainer, folder.path)
         show(job, folder.path, trainer, psnr)
-        folder.note(finished_at_step=trainer.global_step, psnr=psnr)
+        folder.note(finished_at_step=trainer.global_step, budget_seconds=job.config.budget.seconds, psnr=psnr)
     return Trained(folder.path, psnr)

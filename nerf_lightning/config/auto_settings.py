@@ -35,6 +35,11 @@ After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and
 STEPS_SETTING = "model.levels.fine.sampler.num_steps"
 GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
 """Who has typed one of them has chosen the grid."""
+SETTLED = (
+    *("encoder.max_resolution", "encoder.log2_table_size", "field.color_layers"),
+    *(STEPS_SETTING, "data.batch_rays", "data.sample_budget"),
+)
+"""What model=auto may set beside the model and the loss."""
 LARGE, LARGE_CELLS = "fast_large", 1024
 """The model of a scene in a box on a GPU, whose pixels are as small as the cells of so fine a grid, or smaller."""
 LARGE_STEPS, LARGE_TABLE = 576, 19
@@ -71,7 +76,7 @@ def resolve_auto(
     """Return the config in which nothing is left open, and the names picked from each group.
 
     `choices` are those picked so far, and `overrides` what the config was composed with. A run that is gone on with
-    (`former`: its config) keeps the batches that it began with, on whatever device.
+    (`former`: its config) keeps what was chosen for it, on whatever device and for however long.
 
     Raises:
         InputError: a setting that is neither a value nor auto.
@@ -81,7 +86,7 @@ def resolve_auto(
     seconds = config.budget.seconds
     if seconds == AUTO:
         seconds = PHOTOS_SECONDS if of_photos else None
-    config, choices = fit_model("train", config, choices, overrides, scene, _on_gpu(overrides, on_gpu, former), seconds)
+    config, choices = fit_model("train", config, choices, overrides, scene, on_gpu, seconds, former)
     _settle(config, "doctor", of_photos)
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
@@ -99,22 +104,39 @@ def fit_model(
     scene: Scene,
     on_gpu: bool,
     seconds: int | float | None = None,
+    former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, Mapping[str, Any]]:
     """Return a command's config with what model=auto means for a scene, if it was chosen, and the names picked.
 
-    `seconds` of training; None: nobody has said. What a person has typed stays.
+    `seconds` of training; None: nobody has said. `former` is the config of a run that is gone on with. What a person
+    has typed stays.
     """
     if choices.get("model") != AUTO:
         return config, choices
-    fitted, picked = compose_config(command, [*overrides, *_for_scene(scene, overrides, on_gpu, seconds)])
+    suited = _for_scene(scene, overrides, on_gpu, seconds) if former is None else _as_begun(scene, overrides, former)
+    fitted, picked = compose_config(command, [*overrides, *suited])
     fitted.paths = config.paths
     return fitted, picked
+
+
+def settled(config: Mapping[str, Any]) -> list[str]:
+    """Return the overrides that repeat the numbers that model=auto has chosen for a run, by the run's config.
+
+    A section that is not there, and whatever is no whole number, is passed over: the config may come from anybody.
+    """
+    found = []
+    for key in SETTLED:
+        value: Any = config
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        found += [f"{key}={value}"] if type(value) is int else []
+    return found
 
 
 def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
     """Return the model that suits a scene, with what suits the model, and say so."""
     name, reason = model_for(scene)
-    large = name == IN_A_BOX and grid_for(scene) >= LARGE_CELLS
+    large = _has_large_pictures(scene)
     if large and on_gpu:
         name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"
     log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
@@ -123,16 +145,22 @@ def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: in
     if large and not on_gpu:
         suited += _for_large_pictures(overrides, short)
     if name == PHOTOGRAPHS:
-        suited += _for_photographs(scene, overrides, short)
+        suited += [*_grid_for_photographs(scene, overrides, short), *_loss_for(scene, overrides)]
     return suited + (_for_gpu(name, overrides) if on_gpu else [])
 
 
-def _on_gpu(overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None) -> bool:
-    """Tell whether to choose as for a GPU: as a run began that is gone on with, on whatever device."""
-    data = (former or {}).get("data")
-    if not isinstance(data, Mapping) or "data.batch_rays" in map(key_of, overrides):
-        return on_gpu
-    return data.get("batch_rays") in [batches["data.batch_rays"] for batches in GPU_BATCHES.values()]
+def _as_begun(scene: Scene, overrides: Sequence[str], former: Mapping[str, Any]) -> list[str]:
+    """Return the model of a run that is gone on with, and the numbers that were chosen for it."""
+    typed, name = set(map(key_of, overrides)), model_for(scene)[0]
+    numbers = [each for each in settled(former) if key_of(each) not in typed]
+    if _has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
+        name = LARGE
+    loss = _loss_for(scene, overrides) if name == PHOTOGRAPHS else []
+    return [f"model={name}", *loss, *numbers]
+
+
+def _has_large_pictures(scene: Scene) -> bool:
+    return model_for(scene)[0] == IN_A_BOX and grid_for(scene) >= LARGE_CELLS
 
 
 def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
@@ -144,8 +172,8 @@ def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
     if not short and not typed & GRID_SETTINGS:
         suited += _grid(LARGE_CELLS, LARGE_TABLE, "because the pictures are large")
     if not short and not typed & {"field", "field.color_layers"}:
-        log.info("field: ngp, because the pictures are large (field=ngp_fast has one color layer fewer)")
-        suited.append("field=ngp")
+        log.info("field: two color layers, because the pictures are large (field.color_layers=1 is faster)")
+        suited.append("field.color_layers=2")
     return suited
 
 
@@ -161,28 +189,26 @@ def _grid(resolution: int, table: int, cause: str) -> list[str]:
     return [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
 
 
-def _for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> list[str]:
-    """Return the grid and the loss that suit photographs; what a person has typed stays.
-
-    `short`: there is little time for training.
-    """
-    typed = set(map(key_of, overrides))
+def _grid_for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> list[str]:
+    """Return the grid that suits photographs; what a person has typed stays. `short`: there is little time."""
+    if GRID_SETTINGS & set(map(key_of, overrides)):
+        return []
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
-    suited = []
-    if not typed & GRID_SETTINGS:
-        pixels = grid_for(scene)
-        resolution = max(pixels // 2, 512) if short or few else pixels
-        table = 18 if short else TABLE_SIZES[resolution]
-        cause = "the run is short" if short else "there are few photographs and no known distances"
-        wide = "as small as the pixels" if resolution == pixels else f"twice as wide as the pixels because {cause}"
-        suited += _grid(resolution, table, wide)
-    if "loss" not in typed and scene.depths is not None:
-        log.info(
-            "loss: depth, since the distance of %s pixels is known (loss=proposal ignores it)",
-            f"{len(scene.depths):,}",
-        )
-        suited.append("loss=depth")
-    return suited
+    pixels = grid_for(scene)
+    resolution = max(pixels // 2, 512) if short or few else pixels
+    cause = "the run is short" if short else "there are few photographs and no known distances"
+    wide = "as small as the pixels" if resolution == pixels else f"twice as wide as the pixels because {cause}"
+    return _grid(resolution, 18 if short else TABLE_SIZES[resolution], wide)
+
+
+def _loss_for(scene: Scene, overrides: Sequence[str]) -> list[str]:
+    """Return the loss that suits photographs, if a person has typed none."""
+    if scene.depths is None or "loss" in map(key_of, overrides):
+        return []
+    log.info(
+        "loss: depth, since the distance of %s pixels is known (loss=proposal ignores it)", f"{len(scene.depths):,}"
+    )
+    return ["loss=depth"]
 
 
 def _for_gpu(model: str, overrides: Sequence[str]) -> list[str]:

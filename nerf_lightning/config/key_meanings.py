@@ -96,13 +96,13 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         "model.** encoder.** direction_encoder.** field.** loss.** plain_loss.** correction.** refinement.** "
         "optimizer.** scheduler.** data.** callbacks.collapse_guard.**",
     ),
-    (LEARNT, "scene.** budget.** trainer.clip_norm"),
+    (LEARNT, "scene.** trainer.clip_norm"),
     (OWN_COLUMN, "seed model scene scene.name scene.root scene.video"),
     (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
     (FIRST_START, "init_from"),
     (MACHINE, "trainer.**"),
     (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched otherwise
-    (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
+    (LENGTH, "budget.** trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
     (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),
     (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.views"),

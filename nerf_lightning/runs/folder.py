@@ -124,7 +124,7 @@ def open_run(
 
     Args:
         config: the run's config.
-        num_steps: its length; a run that finished earlier counts as unfinished.
+        num_steps: its length; a run that finished earlier counts as unfinished, as does one with a shorter budget.
         job_folder: the folder that a sweep gives this job, or None for a single run.
         asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand.
         typed: the overrides of the command line.
@@ -204,7 +204,8 @@ def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_fo
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()
-        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), num_steps, of_job)
+        length = num_steps, number(config.budget.seconds)
+        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), length, of_job)
     if folder is None:
         return _fresh(Path(config.paths.root_dir) / config.scene.name), False
     return folder, resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
@@ -230,14 +231,15 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
             f"it; a run with the same settings (.hydra/overrides.yaml) and {to_type('paths.output_dir', str(folder))} "
             "then resumes from its checkpoints. Or give another folder with paths.output_dir=DIR."
         )
-    if begun_with == fingerprint(identity):
+    other = _former_identity(folder)
+    # The config alone decides where another version counts other settings to a run's identity.
+    if fingerprint(identity) == begun_with or identity == other:
         if resuming:
             return
         raise InputError(
             f"{folder} already contains a run with these settings. Add resume=auto to resume it, or give another "
             "folder with paths.output_dir=DIR."
         )
-    other = _former_identity(folder)
     newer = _newer_settings(folder, identity, other) if isinstance(other, dict) and resuming else []
     if newer and not typed & set(newer):
         shown = ", ".join(f"{key}={identity[key]}" for key in newer)
@@ -279,15 +281,22 @@ def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 
-def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
+def _newest_unfinished(root: Path, digest: str, length: tuple[int, float | None], of_job: str | None) -> Path | None:
     folders = folders_of_runs(root)
     for folder in sorted(folders, key=lambda folder: (folder / "run.json").stat().st_mtime, reverse=True):
         note = read_note(folder)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
-        finished = number(note.get("finished_at_step"))
-        if ours and (finished is None or finished < num_steps):
+        if ours and not _is_over(note, *length):
             return folder
     return None
+
+
+def _is_over(note: Mapping[str, Any], num_steps: int, seconds: float | None) -> bool:
+    """Tell whether a run has finished and would take no further step with so many steps and seconds."""
+    finished, used = number(note.get("finished_at_step")), number(note.get("budget_seconds"))
+    if finished is None:
+        return False
+    return finished >= num_steps or (seconds is not None and used is not None and used >= seconds)
 
 
 def _fresh(parent: Path) -> Path:

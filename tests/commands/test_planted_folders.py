@@ -340,7 +340,7 @@ def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
     """The note is anybody's; a training that goes on in its folder writes its own numbers there at the end."""
     note = {"fingerprint": "0", "seconds": value, "finished_at_step": value}
     (run / "run.json").write_text(json.dumps(note))
-    assert _newest_unfinished(run.parent, "0", 10, None) == run
+    assert _newest_unfinished(run.parent, "0", (10, 60.0), None) == run
     RunFolder(run, FileLock(run / "lock"), None).note(finished_at_step=12)
     found = read_note(run)
     assert found["finished_at_step"] == 12

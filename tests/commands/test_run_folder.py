@@ -61,6 +61,15 @@ def test_a_longer_run_takes_a_finished_one_for_unfinished(tmp_path):
     assert begin(config(tmp_path, "trainer.max_steps=200", "resume=auto"), steps=200).path == run.path
 
 
+def test_a_run_whose_budget_is_used_up_is_gone_on_with_for_a_larger_one_only(tmp_path):
+    run = begin(config(tmp_path, "budget.seconds=60"))
+    run.note(finished_at_step=50, budget_seconds=60)
+    run.release()
+    assert begin(config(tmp_path, "budget.seconds=300", "resume=auto")).path == run.path
+    run.note(finished_at_step=50, budget_seconds=60)
+    assert begin(config(tmp_path, "budget.seconds=60", "resume=auto")).path != run.path
+
+
 def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path):
     begin(config(tmp_path, f"paths.output_dir={tmp_path}/here")).release()
     before = json.loads((tmp_path / "here/run.json").read_text())

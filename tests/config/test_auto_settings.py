@@ -55,10 +55,11 @@ def test_a_gpu_takes_larger_batches_and_for_large_pictures_a_larger_model_and_sa
     assert picked["model"] == model
     assert larger.data.batch_rays == GPU_BATCHES[model]["data.batch_rays"] == 2 * plain.data.batch_rays
     assert caplog.text.count("about 2^18 samples a step") == 1
-    # A run goes on with the batches that it began with, wherever that was.
+    # A run goes on with what was chosen for it, wherever and for however long that was.
+    config.budget.seconds = 5
     for on_gpu, former in ((True, plain), (False, larger)):
         again = resolve_auto(config, choices, [], scene, on_gpu, OmegaConf.to_container(former, resolve=True))[0]
-        assert (again.data, again.encoder) == (former.data, former.encoder)
+        assert {**again, "budget": None} == {**former, "budget": None}
     typed = ["data.batch_rays=77", "data.sample_budget=5000"]
     config, choices = compose_config("train", typed)
     assert resolve_auto(config, choices, typed, scene, on_gpu=True)[0].data.batch_rays == 77

@@ -8,12 +8,13 @@ from omegaconf import OmegaConf
 
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.commands.train import run as train
-from nerf_lightning.config.auto_settings import AUTO
+from nerf_lightning.config.auto_settings import AUTO, settled
 from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.folders import option_names
+from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.output_folder import beside_checkpoint
 from nerf_lightning.runs.saved_overrides import former_overrides
@@ -47,9 +48,10 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
     length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
     former = open_sections([*former_overrides(folder, length), *length])
     config, choices = compose_config("train", former)
-    settled = checkpoint.choices.get("model")
-    if choices.get("model") == AUTO and settled in option_names("model"):
-        former.append(f"model={settled}")  # what the scene had chosen
+    if choices.get("model") == AUTO:  # what was chosen for the scene
+        picked = {group: checkpoint.choices.get(group) for group in ("model", "loss")}
+        former += [f"{group}={name}" for group, name in picked.items() if name in option_names(group)]
+        former += settled(plain_yaml(checkpoint.config, f"The config in {checkpoint.path}"))
         config, _ = compose_config("train", former)
     model = OmegaConf.to_container(config.model, resolve=False)
     return [*former, *dict.fromkeys(f"{_setting(model, name)}={width}" for name, width in widths.items())]

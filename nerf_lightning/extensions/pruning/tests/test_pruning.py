@@ -1,6 +1,7 @@
 """Which neurons and table entries stay, and `nerf prune` from end to end."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from support.running import refused, said
 from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.extensions.pruning.fine_tuning import fine_tuning
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights, reached_entries
 from nerf_lightning.extensions.pruning.selection import Neurons, choose, coreset, importance
@@ -107,6 +110,20 @@ def test_a_run_is_pruned_packed_and_trained_on(nerf, stopped_fast, tmp_path):
         nerf(*given, f"paths.output_dir={tmp_path}/small", "finetune_steps=2"),
         f"{run} already contains a fine-tuning run",
     )
+
+
+def test_fine_tuning_repeats_what_was_chosen_for_the_scene(stopped_fast, tmp_path):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text("[scene=bricks, seed=3]")  # model=auto
+    checkpoint = replace(
+        read_checkpoint(stopped_fast),
+        path=tmp_path,
+        choices={"model": "fast_proposal", "loss": "depth"},
+        config="{encoder: {max_resolution: 77, log2_table_size: 9}, data: {batch_rays: not a number}}",
+    )
+    config, choices = compose_config("train", fine_tuning(checkpoint, {"levels.fine.field": 8}, 2))
+    assert (choices["model"], choices["loss"], config.seed) == ("fast_proposal", "depth", 3)
+    assert (config.encoder.max_resolution, config.encoder.log2_table_size, config.field.width) == (77, 9, 8)
 
 
 def test_bad_input_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):
