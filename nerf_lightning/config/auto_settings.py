@@ -33,11 +33,12 @@ After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and
 """
 
 STEPS_SETTING = "model.levels.fine.sampler.num_steps"
+RAYS_SETTING = "model.subpixels"
 GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
 """Who has typed one of them has chosen the grid."""
 SETTLED = (
     *("encoder.max_resolution", "encoder.log2_table_size", "field.color_layers"),
-    *(STEPS_SETTING, "data.batch_rays", "data.sample_budget"),
+    *(STEPS_SETTING, RAYS_SETTING, "data.batch_rays", "data.sample_budget"),
 )
 """What model=auto may set beside the model and the loss."""
 LARGE, LARGE_CELLS = "fast_large", 1024
@@ -142,8 +143,8 @@ def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: in
     log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
     suited = [f"model={name}"]
     short = seconds is not None and seconds < (SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS)
-    if large and not on_gpu:
-        suited += _for_large_pictures(overrides, short)
+    if name == IN_A_BOX and not on_gpu:
+        suited += _for_large_pictures(overrides, short) if large else _for_small_pictures(overrides, short)
     if name == PHOTOGRAPHS:
         suited += [*_grid_for_photographs(scene, overrides, short), *_loss_for(scene, overrides)]
     return suited + (_for_gpu(name, overrides) if on_gpu else [])
@@ -175,6 +176,22 @@ def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
         log.info("field: two color layers, because the pictures are large (field.color_layers=1 is faster)")
         suited.append("field.color_layers=2")
     return suited
+
+
+def _for_small_pictures(overrides: Sequence[str], short: bool) -> list[str]:
+    """Return the rays of a pixel that suit small pictures of a scene in a box; what a person has typed stays.
+
+    After 100 s, Lego at 200 x 200 has 34.58 dB with 2 x 2 rays and 33.64 dB with one; at 800 x 800 (300 s) 33.51 and
+    33.45.
+    """
+    if short or {RAYS_SETTING, "loss"} & set(map(key_of, overrides)):
+        return []
+    log.info(
+        "rays: 2 x 2 through each pixel at the end of the run, because the pictures are small (%s=1 renders four times "
+        "as fast)",
+        RAYS_SETTING,
+    )
+    return [f"{RAYS_SETTING}=2"]
 
 
 def _grid(resolution: int, table: int, cause: str) -> list[str]:

@@ -11,7 +11,13 @@ from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.compute import devices
-from nerf_lightning.config.auto_settings import GPU_BATCHES, STEPS_SETTING, resolve_auto, resolve_correction
+from nerf_lightning.config.auto_settings import (
+    GPU_BATCHES,
+    RAYS_SETTING,
+    STEPS_SETTING,
+    resolve_auto,
+    resolve_correction,
+)
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
@@ -96,6 +102,24 @@ def test_large_pictures_of_a_box_take_finer_steps_and_with_time_a_larger_model(c
     assert (config.model.levels.fine.sampler.num_steps, *grid, config.field.color_layers) == suited
     assert ("steps: 576 across the box" in caplog.text) == (suited[0] == 576)
     assert ("encoder: 1024 cells per side, because" in caplog.text) == (suited[1] == 1024)
+
+
+@pytest.mark.parametrize(
+    ("scene", "overrides", "rays"),
+    [
+        (IN_A_BOX, (), 2),
+        (IN_A_BOX, ("budget.seconds=300",), 2),
+        (IN_A_BOX, ("budget.seconds=60",), 1),
+        (IN_A_BOX, ("loss=robust",), 1),
+        (IN_A_BOX, (f"{RAYS_SETTING}=3",), 3),
+        (LARGE_PICTURES, (), 1),
+        (PHOTOGRAPHS, (), 1),
+    ],
+)
+def test_small_pictures_of_a_box_take_several_rays_a_pixel_with_time(caplog, scene, overrides, rays):
+    caplog.set_level("INFO")
+    assert chosen_for(scene, *overrides)[0].model.subpixels == rays
+    assert ("rays: 2 x 2 through each pixel at the end of the run, because" in caplog.text) == (rays == 2)
 
 
 def with_depths(scene, distance=1.0):

@@ -17,7 +17,7 @@ BUDGETS = {
     # host: a step.
     "fast_small,bf16-mixed": (87, 25, 38, 2),
     "fast_proposal,bf16-mixed": (132, 27, 33, 2),
-    "nerf_tiny,bf16-mixed": (319, 25, 120, 4),
+    "nerf_tiny,bf16-mixed": (271, 25, 120, 4),
     "fast,bf16-mixed": (87, 25, 38, 2),
     "fast,32-true": (97, 25, 42, 2),
     "fast_proposal,32-true": (152, 27, 41, 2),

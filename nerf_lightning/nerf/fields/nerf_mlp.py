@@ -107,7 +107,9 @@ class NerfMLP(Field):
         # Encoded once per ray, not once per sample.
         direction = self.direction_encoder(points.directions).to(feature.dtype)
         direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
-        raw_rgb = _exactly(self.color_head, self.color_hidden(torch.cat([feature, direction], dim=-1)))
+        joined = torch.cat([feature, direction], dim=-1)
+        rows = joined.reshape(-1, joined.shape[-1])
+        raw_rgb = _exactly(self.color_head, self.color_hidden(rows)).view(*feature.shape[:-1], 3)
         noise = None
         if points.random is not None and self.density_noise > 0:
             noise = self.density_noise * points.random.normal("density_noise")
@@ -154,13 +156,14 @@ class NerfMLP(Field):
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
             positions = contract(in_unit_ball(positions, self.aabb))
-        encoded = self.position_encoder(positions)
+        # As rows: torch multiplies these anyway, and a ReLU in place on a view of them would copy its gradients.
+        encoded = self.position_encoder(positions.reshape(-1, 3))
         hidden = encoded
         for index, layer in enumerate(self.trunk):
             if index == self.skip:
                 hidden = torch.cat([hidden, encoded.to(hidden.dtype)], dim=-1)
             hidden = layer(hidden)
-        return hidden
+        return hidden.view(*positions.shape[:-1], -1)
 
     def _activate(self, raw: Tensor, noise: Tensor | None) -> Tensor:
         # Densities multiply lengths of 1e-3 and enter exponentials: always in float32.

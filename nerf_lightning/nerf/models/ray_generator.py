@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import at_most, rays_through_pixels
 from nerf_lightning.nerf.geometry.ndc import share_at_distance
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
@@ -70,6 +70,12 @@ class RayGenerator(Part):
             scene.capture_of,
             names_photographs=model.needs_photographs,
         )
+
+    @torch.no_grad()
+    def at_most(self, longest: int) -> "RayGenerator":
+        """Return what makes the rays of smaller pictures, whose longer sides are no longer than this, in pixels."""
+        captures = None if self.capture_of is None else self.capture_of.tolist()
+        return RayGenerator(at_most(self.cameras, longest), self.near, self.far, None, captures, self.names_photographs)
 
     @property
     def cameras(self) -> Cameras:

@@ -5,6 +5,7 @@ from typing import Any
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
+from torch.nn import functional
 
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.made_folders import make_folder
@@ -13,7 +14,7 @@ from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
 from nerf_lightning.training.loggers import show_picture
 from nerf_lightning.visualization.camera_layout import layout_picture
-from nerf_lightning.visualization.pictures import at_most, mosaic, panels, save_png, to_bytes
+from nerf_lightning.visualization.pictures import mosaic, panels, save_png, to_bytes
 
 
 class ValidationPictures(Watcher):
@@ -39,9 +40,10 @@ class ValidationPictures(Watcher):
         step = trainer.global_step
         view, picture = render_validation_view(trainer, system, self.view)
         scene = trainer.datamodule.scene
-        truth = photograph(scene, view, scene.background)
+        whole = photograph(scene, view, scene.background).movedim(-1, 0)
+        truth = functional.interpolate(whole[None], picture.rgb.shape[:2], mode="area")[0].movedim(0, -1)
         panel = mosaic(panels(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity))
-        for name, shown in (("validation", panel), ("progress", at_most(to_bytes(picture.rgb)))):
+        for name, shown in (("validation", panel), ("progress", to_bytes(picture.rgb))):
             folder = make_folder(Path(trainer.default_root_dir), "images", name)
             save_png(folder / f"step_{step:07d}.png", shown)
         show_picture(trainer.loggers, "validation/picture", panel, step)

@@ -15,6 +15,7 @@ from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
+from nerf_lightning.visualization.pictures import LONGEST_PANEL
 
 
 class Watcher(Callback):
@@ -85,13 +86,14 @@ def _writes(thread: threading.Thread | None) -> bool:
 def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
     """Return the number-th validation view (counted round) and its picture, in the precision of training.
 
-    Where there are none, of the training views.
+    Where there are none, of the training views. The picture is no larger than what is shown of it.
     """
     scene = trainer.datamodule.scene
     views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
     tile_points = system.step.tile_points or WHOLE_BATCH_POINTS
     system.eval()
-    picture = render_picture(system.model, system.rays, view, scene.background, tile_points)
+    rays = system.rays.at_most(LONGEST_PANEL)
+    picture = render_picture(system.model, rays, view, scene.background, tile_points)
     system.train()
     return view, picture

@@ -11,6 +11,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.types.rays import PixelIndex
 
 
 def test_a_pixel_has_the_ray_of_its_camera_and_rays_through_the_world_are_not_bent():
@@ -26,6 +27,20 @@ def test_a_pixel_has_the_ray_of_its_camera_and_rays_through_the_world_are_not_be
     straight = RayGenerator(forward, scene.near, scene.far)(pixels)
     assert torch.equal(bent.through_world(pixels).origins, straight.origins)
     assert not torch.allclose(bent(pixels).origins, straight.origins)
+
+
+def test_rays_of_a_smaller_picture_pass_through_the_middles_of_squares_as_learned():
+    scene = ball_scene()
+    whole = LearntShifts(scene.cameras, scene.near, scene.far)
+    torch.nn.init.constant_(whole.shift, 0.1)
+    side = int(scene.cameras.width[2])
+    small = whole.at_most(side // 2)
+    corners = PixelIndex(*(torch.tensor(each) for each in ([2, 2], [0, 4], [0, 2])))
+    found = small(PixelIndex(corners.view, corners.x // 2, corners.y // 2))
+    expected = whole(corners, torch.full((2, 2), 0.5))
+    torch.testing.assert_close((found.origins, found.directions), (expected.origins, expected.directions))
+    assert not found.origins.requires_grad
+    assert torch.equal(whole.at_most(side)(corners).directions, whole(corners).directions)
 
 
 def test_cameras_can_learn_in_tiles_and_whole():
