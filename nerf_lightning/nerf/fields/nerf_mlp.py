@@ -163,7 +163,7 @@ class NerfMLP(Field):
             if index == self.skip:
                 hidden = torch.cat([hidden, encoded.to(hidden.dtype)], dim=-1)
             hidden = layer(hidden)
-        return hidden.view(*positions.shape[:-1], -1)
+        return hidden.view(*positions.shape[:-1], hidden.shape[-1])
 
     def _activate(self, raw: Tensor, noise: Tensor | None) -> Tensor:
         # Densities multiply lengths of 1e-3 and enter exponentials: always in float32.
