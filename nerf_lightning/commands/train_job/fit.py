@@ -78,7 +78,8 @@ def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
             job.num_steps,
         )
         job.num_steps = former.num_steps
-    folder.note(num_steps=job.num_steps)
+    if job.config.budget.seconds is None:
+        folder.note(num_steps=job.num_steps)
 
 
 def _prepare(job: TrainJob, folder: HeldFolder) -> None:

@@ -2,6 +2,7 @@
 
 import signal
 import time
+from dataclasses import asdict, dataclass
 from types import FrameType
 from typing import Any, ClassVar
 
@@ -12,10 +13,21 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
 
 
+@dataclass
+class Used:
+    """What has been used of a budget, as a checkpoint keeps it."""
+
+    used: float
+    """Seconds,"""
+    first: int = 0
+    """since this step."""
+
+
 class TimeBudget(Callback):
     """Stop after so many seconds of training, and stretch the schedule to just that length.
 
-    The time that a run has used is part of its state, so a resumed run has the rest. While the process is stopped
+    The time that a run has used is part of its state, so a resumed run has the rest; one that had no budget before has
+    all of it. While the process is stopped
     (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by the first step of a process, which may
     compile kernels for half a minute. Such a run is not repeatable to the bit: how many steps fit depends on the
     machine.
@@ -25,14 +37,13 @@ class TimeBudget(Callback):
         every_steps: steps between two estimates of the run's length.
     """
 
-    STATE: ClassVar = {"used": float}
-    needs_state = True
+    STATE: ClassVar = Used
 
     def __init__(self, seconds: float, every_steps: int = 10):
         if seconds <= 0:
             raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
         self.seconds, self.every_steps = seconds, every_steps
-        self.used, self.since, self.compiles = 0.0, 0.0, True
+        self.used, self.first, self.since, self.compiles = 0.0, 0, 0.0, True
         self.former: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
@@ -41,6 +52,8 @@ class TimeBudget(Callback):
             self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
             self._fit_schedule(trainer, pl_module.step)
+        else:
+            self.first = pl_module.step.progress.step
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
@@ -66,11 +79,12 @@ class TimeBudget(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the time used, across a resume."""
-        return {"used": self.used}
+        return asdict(Used(self.used, self.first))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the count up again."""
-        self.used = state_dict["used"]
+        known = Used(**state_dict)
+        self.used, self.first = known.used, known.first
 
     def _woken(self, number: int, frame: FrameType | None) -> None:
         # When the stop began is not known: what was done of the step is left out with it.
@@ -78,6 +92,5 @@ class TimeBudget(Callback):
 
     def _fit_schedule(self, trainer: Trainer, training: Any) -> None:
         step = training.progress.step
-        training.num_steps = min(
-            int(trainer.estimated_stepping_batches), max(step + 1, int(step * self.seconds / self.used))
-        )
+        expected = self.first + int((step - self.first) * self.seconds / self.used)
+        training.num_steps = min(int(trainer.estimated_stepping_batches), max(step + 1, expected))

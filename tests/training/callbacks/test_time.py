@@ -69,6 +69,22 @@ def test_a_resumed_run_takes_up_its_schedule_at_once_and_a_new_one_keeps_its_len
     assert system.step.num_steps == 200_000
 
 
+def test_a_run_that_had_no_budget_has_all_of_it_from_where_it_is_gone_on_with(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    budget, system = TimeBudget(seconds=10.0, every_steps=1), a_system(step=500)
+    budget.on_train_start(trainer(), system)
+    for step in (501, 502, 503):  # the first is not counted
+        now[0] += 1.0
+        system.step.progress.step = step
+        budget.on_train_batch_end(trainer(), system, None, None, 0)
+    assert system.step.num_steps == 500 + 3 * 10.0 / 2.0
+    resumed = TimeBudget(seconds=20.0)
+    resumed.load_state_dict(budget.state_dict())
+    resumed.on_train_start(trainer(), system)
+    assert system.step.num_steps == 500 + 3 * 20.0 / 2.0
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no process is stopped there")
 def test_a_stopped_process_uses_no_time(monkeypatch):
     now = [100.0]
