@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
-from nerf_lightning.config.overrides import key_of
+from nerf_lightning.config.overrides import key_of, leaves
 from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
@@ -125,13 +125,8 @@ def settled(config: Mapping[str, Any]) -> list[str]:
 
     A section that is not there, and whatever is no whole number, is passed over: the config may come from anybody.
     """
-    found = []
-    for key in SETTLED:
-        value: Any = config
-        for name in key.split("."):
-            value = value.get(name) if isinstance(value, Mapping) else None
-        found += [f"{key}={value}"] if type(value) is int else []
-    return found
+    values = leaves(config)
+    return [f"{key}={values[key]}" for key in SETTLED if type(values.get(key)) is int]
 
 
 def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: int | float | None) -> list[str]:

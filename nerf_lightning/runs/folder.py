@@ -28,7 +28,7 @@ from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.key_meanings import fingerprint
-from nerf_lightning.config.overrides import key_of, to_type
+from nerf_lightning.config.overrides import key_of, leaves, to_type
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
@@ -232,8 +232,8 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
             "then resumes from its checkpoints. Or give another folder with paths.output_dir=DIR."
         )
     other = _former_identity(folder)
-    # The config alone decides where another version counts other settings to a run's identity.
-    if fingerprint(identity) == begun_with or identity == other:
+    older = isinstance(other, dict) and identity == other and _is_as_begun(folder, other)
+    if begun_with == fingerprint(identity) or older:
         if resuming:
             return
         raise InputError(
@@ -255,8 +255,16 @@ def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], r
 def _newer_settings(folder: Path, identity: dict[str, Any], other: dict[str, Any]) -> list[str]:
     """Return the settings that came into the program after a run was begun; none where anything else differs."""
     known = {key: value for key, value in identity.items() if key in other}
-    as_begun = read_note(folder).get("fingerprint") == fingerprint(other)
-    return sorted(identity.keys() - other.keys()) if known == other and as_begun else []
+    return sorted(identity.keys() - other.keys()) if known == other and _is_as_begun(folder, other) else []
+
+
+def _is_as_begun(folder: Path, other: dict[str, Any]) -> bool:
+    """Tell whether the run in a folder began with what its config says now.
+
+    Versions up to 1.0.0 counted the budget to a run's identity.
+    """
+    budget = leaves(read_plain_yaml(folder / ".hydra" / "config.yaml").get("budget"), "budget")
+    return read_note(folder).get("fingerprint") in (fingerprint(other), fingerprint(other | budget))
 
 
 def _former_identity(folder: Path) -> dict[str, Any] | str:

@@ -11,10 +11,11 @@ from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.config.key_meanings import fingerprint
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
-from nerf_lightning.runs.identity import settings_digest
+from nerf_lightning.runs.identity import run_identity, settings_digest
 
 HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}
 
@@ -100,6 +101,21 @@ def test_a_run_that_is_older_than_a_setting_goes_on_with_its_default(tmp_path, c
     open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here"]).release()
     assert "continues with model.subpixels=1, trainer.clip_norm=None." in caplog.text
     assert begin(config(tmp_path, here, "resume=auto")).path == tmp_path / "here"
+
+
+@pytest.mark.parametrize("lost", [(), ("model.subpixels",)])
+def test_a_run_of_a_version_that_counted_the_budget_to_it_goes_on(tmp_path, lost):
+    here = f"paths.output_dir={tmp_path}/here"
+    older = without(config(tmp_path, here, "budget.seconds=60"), *lost)
+    run = begin(older)
+    run.note(fingerprint=fingerprint(run_identity(older) | {"budget.seconds": 60}))
+    run.release()
+    begin(config(tmp_path, f"resume={tmp_path}/here", "budget.seconds=300")).release()
+    with pytest.raises(InputError, match=r"other settings \(seed: there 0, here 3"):
+        open_run(config(tmp_path, f"resume={tmp_path}/here", "seed=3"), 100, None)
+    run.note(fingerprint="of a config that was changed by hand")
+    with pytest.raises(InputError, match="contains a run with other settings"):
+        open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
 
 
 def test_a_config_that_lost_settings_since_the_run_began_is_another_one(tmp_path):

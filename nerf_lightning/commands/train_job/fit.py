@@ -78,7 +78,7 @@ def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
             job.num_steps,
         )
         job.num_steps = former.num_steps
-    if job.config.budget.seconds is None:
+    if job.config.budget.seconds is None:  # else the time ends it, and its learning rate has followed that
         folder.note(num_steps=job.num_steps)
 
 

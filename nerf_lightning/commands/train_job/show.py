@@ -12,11 +12,11 @@ from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
+from nerf_lightning.commands.train_job.fit import resume_command
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.open_checkpoint import LoadedModel, as_known
-from nerf_lightning.config.overrides import to_type
 from nerf_lightning.doctor.examine import advice
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.made_folders import make_folder, remove_empty
@@ -61,8 +61,9 @@ def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total = used + len(job.scene.left_out)
     quality = "" if psnr is None else f"{psnr:.1f} dB on held-out photographs, "
-    resumed = f"nerf train {to_type('resume', str(page.parent))}"
-    longer = "train longer" if seconds is None else f"{resumed} budget.seconds={2 * seconds:g} trains twice as long"
+    longer = "train longer"
+    if seconds is not None:
+        longer = f"{resume_command(page.parent)} budget.seconds={2 * seconds:g} trains twice as long"
     cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
     return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
 

@@ -27,10 +27,9 @@ class TimeBudget(Callback):
     """Stop after so many seconds of training, and stretch the schedule to just that length.
 
     The time that a run has used is part of its state, so a resumed run has the rest; one that had no budget before has
-    all of it. While the process is stopped
-    (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by the first step of a process, which may
-    compile kernels for half a minute. Such a run is not repeatable to the bit: how many steps fit depends on the
-    machine.
+    all of it. While the process is stopped (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by
+    the first step of a process, which may compile kernels for half a minute. Such a run is not repeatable to the bit:
+    how many steps fit depends on the machine.
 
     Args:
         seconds: training time in all, validation included.
