@@ -13,8 +13,9 @@ from nerf_lightning.selftest.training import METHODS
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 STEPS, TILE_POINTS = 50, 8192
 CPU = torch.device("cpu")
-# Of the difference that another order of sums makes on the CPU: how much more a GPU's may make.
-MORE = 10.0
+# Of the difference that another order of sums makes on the CPU: how much more a GPU's may make, which adds in another
+# order in each run, and fuses products with sums.
+MORE = 30.0
 LEAST = 1e-4  # relative; the order of sums of a step's some ten thousand samples, 2^-24 each, at worst: 6e-4
 
 
@@ -28,7 +29,7 @@ def losses(model, device, tile_points=None):
 
 @pytest.mark.parametrize("model", options("model"))
 def test_every_model_follows_the_cpu(model, device):
-    """For 50 steps, within ten times what another order of sums does to the CPU's own losses up to that step."""
+    """For 50 steps, within thirty times what another order of sums does to the CPU's own losses up to that step."""
     expected = losses(model, CPU)
     with without(*CPU_BACKENDS):
         otherwise = losses(model, CPU, TILE_POINTS)
@@ -48,6 +49,7 @@ def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, de
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")  # torch's, of itself
 def test_compiled_fields_compute_the_same(cuda):
     made = training.Training("nerf_tiny", cuda, "float32", None)
     assert made.step.model.compile_fields()
