@@ -6,6 +6,7 @@ is stored but how many rays have been seen, so a resumed run goes on exactly whe
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from types import ModuleType
 
 import torch
 from jaxtyping import Int
@@ -90,9 +91,6 @@ class PixelDomain:
             number: of pixels, or of squares, for each of which all pixels are returned, in one row.
             shift: of the grid of squares, in pixels, below `patch`.
         """
-        kernels = cuda_backend("pixels.cuda", self.ends.device) if self.patch == 1 else None
-        if kernels is not None:
-            return PixelIndex(*kernels.locate(number, self.ends, self.width, self.views, self.left, self.top))
         slot = torch.searchsorted(self.ends, number, right=True)
         within = number - (self.ends[slot] - self.sizes[slot])
         row = torch.div(within, self.columns[slot], rounding_mode="floor")
@@ -116,10 +114,6 @@ class PixelDomain:
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
     """Return colors and weights of pixels."""
     store, mask = scene.pixels, scene.pixels.mask
-    kernels = cuda_backend("pixels.cuda", store.rgba.device)
-    if kernels is not None:
-        shown = kernels.gather(pixels.view, pixels.x, pixels.y, store.offset, store.width, store.rgba, mask)
-        return Batch(pixels, *shown)
     flat = store.index_of(pixels.view, pixels.x, pixels.y)
     return Batch(
         pixels=pixels,
@@ -213,31 +207,40 @@ class RayBatches:
     @torch_on_one_thread()
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
+        kernels = cuda_backend("pixels.cuda", self.whole.ends.device)
+        if kernels is not None and self.patch == 1 and self.views is None:
+            return self._in_one_kernel(kernels, attempt, rays_seen, batch_rays)
         pixels = self.pixels_at(attempt, rays_seen, batch_rays)
         batch = gather_batch(self.scene, pixels)
         if self.depths is None:
             return batch
         return self.depths.told(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
+    def _in_one_kernel(self, kernels: ModuleType, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
+        domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
+        store, of_known, known = self.scene.pixels, None, None
+        if self.depths is not None:
+            told, key = self.depths.depths, fold(self.seed, attempt, "depths")
+            of_known = kernels.Order(self._depth_places_at(rays_seen, batch_rays), len(self.depths), key)
+            known = kernels.Known(told.pixels.view, told.pixels.x, told.pixels.y, told.distance, told.certainty)
+        view, x, y, *shown = kernels.batch(
+            kernels.Order(places, len(domain), fold(self.seed, attempt, purpose)),
+            kernels.Domain(domain.ends, domain.width, domain.views, domain.left, domain.top),
+            kernels.Store(store.offset, store.width, store.rgba, store.mask),
+            of_known,
+            known,
+        )
+        return Batch(PixelIndex(view, x, y), *shown)
+
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""
-        position, count, slots = self._squares_at(rays_seen, batch_rays)
-        before = self._num_depths(position)
-        num_depths = self._num_depths(position + count) - before
-        position, count = position - before, count - num_depths
-        slots = range(min(slots.start, count), min(slots.stop, count))
-        crop_squares = self.crop_rays(attempt - self.progress.rollbacks) // self.patch**2
-        if position < crop_squares:
-            domain, purpose = self.crop, "crop"
-        else:
-            domain, purpose, position = self.whole, "rays", position - crop_squares
+        domain, purpose, together, places = self._places_at(attempt, rays_seen, batch_rays)
         if self.views is not None:
             key = fold(self.seed, attempt, purpose)
             starts, sizes = domain.ends.cpu() - domain.sizes.cpu(), domain.sizes.cpu()
-            mine = torch.arange(slots.start, slots.stop)
-            numbers = rays_of_few_views(starts, sizes, position // count, mine, count, self.views, key)
+            mine, count = torch.arange(places.start, places.stop) - together.start, len(together)
+            numbers = rays_of_few_views(starts, sizes, together.start // count, mine, count, self.views, key)
             return domain.locate(sent(numbers, domain.ends.device))
-        places = range(position + slots.start, position + slots.stop)
         shift: Tensor | int = 0
         if self.patch > 1:  # each epoch has its own grid of squares, so that no pixel always lies at a border
             shift = sent(self._epoch_keys(places, len(domain), attempt, purpose) % self.patch, domain.ends.device)
@@ -246,14 +249,33 @@ class RayBatches:
             return pixels
         return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
 
+    def _places_at(
+        self, attempt: int, rays_seen: int, batch_rays: int | None
+    ) -> tuple[PixelDomain, str, range, range]:
+        """Return the domain of that batch, its name, and places in its order: all of the batch's, this process's."""
+        position, count, slots = self._squares_at(rays_seen, batch_rays)
+        before = self._num_depths(position)
+        num_depths = self._num_depths(position + count) - before
+        position, count = position - before, count - num_depths
+        crop_squares = self.crop_rays(attempt - self.progress.rollbacks) // self.patch**2
+        if position < crop_squares:
+            domain, purpose = self.crop, "crop"
+        else:
+            domain, purpose, position = self.whole, "rays", position - crop_squares
+        together = range(position, position + count)
+        return domain, purpose, together, together[slots.start : slots.stop]
+
     def _depths_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Int[Tensor, "squares"]:
         """Return which pixels of known distance this process has of that batch."""
         assert self.depths is not None
+        return self._in_order(self._depth_places_at(rays_seen, batch_rays), len(self.depths), attempt, "depths")
+
+    def _depth_places_at(self, rays_seen: int, batch_rays: int | None) -> range:
+        """Return where they stand in the order of all pixels of known distance."""
         position, count, slots = self._squares_at(rays_seen, batch_rays)
         before = self._num_depths(position)
         first = count - (self._num_depths(position + count) - before)
-        places = range(before + max(slots.start - first, 0), before + max(slots.stop - first, 0))
-        return self._in_order(places, len(self.depths), attempt, "depths")
+        return range(before + max(slots.start - first, 0), before + max(slots.stop - first, 0))
 
     def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, range]:
         """Return how many squares came before, how many the batch has, and which of them are this process's."""
@@ -266,13 +288,9 @@ class RayBatches:
 
     def _in_order(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "squares"]:
         """Return what stands at each position, every number below `size` once an epoch, where the pixels are."""
-        device = self.whole.ends.device
-        kernels = cuda_backend("random.cuda", device)
-        if kernels is not None:
-            key = fold(self.seed, attempt, purpose)
-            return kernels.in_order(positions.start, len(positions), size, key, device)
         keys = self._epoch_keys(positions, size, attempt, purpose)
-        return sent(permute(torch.arange(positions.start, positions.stop) % size, size, keys), device)
+        number = permute(torch.arange(positions.start, positions.stop) % size, size, keys)
+        return sent(number, self.whole.ends.device)
 
     def _epoch_keys(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "*#squares"]:
         """Return the key of each position's epoch; one, where all lie in the same."""

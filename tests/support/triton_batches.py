@@ -4,35 +4,39 @@ from types import SimpleNamespace
 
 import torch
 
-from nerf_lightning.data.ray_batches import PixelDomain, gather_batch
+from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.kernels.rays.cuda import LENSES
-from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 
 
 def check_pixels(kernels, device, generator, rays):
-    """Bit for bit, the last pixel and no pixel included."""
+    """Bit for bit: within an epoch and across some, in the crop, of views of other sizes, with masks and distances."""
     width, height = torch.tensor([[7, 300, 1, 40], [5, 2, 9, 30]])
     sizes = width * height
     total = int(sizes.sum())
-    rgba = torch.randint(256, (total, 4), generator=generator).to(torch.uint8)
-    offset = sizes.cumsum(0) - sizes
-    for mask in (None, torch.randint(2, (total,), generator=generator).to(torch.uint8)):
-        scene = SimpleNamespace(pixels=PixelStore(rgba, offset, width, height, True, mask))
-        for views, fraction, count in (([0, 1, 2, 3], 1.0, None), ([3], 0.5, None), ([2, 0], 0.5, 1), ([0], 1.0, 0)):
-            domain = PixelDomain(scene, views, fraction)
-            number = torch.arange(len(domain)) if count is None else torch.full((count,), len(domain) - 1)
-            given = number, domain.ends, domain.width, domain.views, domain.left, domain.top
-            expected = domain.locate(number)
-            found = kernels.locate(*(each.to(device) for each in given))
-            shown = gather_batch(scene, expected)
-            arrays = offset, width, rgba
-            read = kernels.gather(
-                *found, *(each.to(device) for each in arrays), None if mask is None else mask.to(device)
-            )
-            for one, other in zip((*found, *read), (*expected.tensors(), shown.rgba, shown.weight), strict=True):
-                assert torch.equal(one.cpu(), other)
+    rgba, mask = torch.randint(256, (total, 4), generator=generator).to(torch.uint8), torch.arange(total) % 3 != 1
+    view = torch.tensor([3, 0, 2, 3, 0])
+    known = PixelIndex(view, width[view] - 1, height[view] - 1)
+    depths = KnownDepths(known, *torch.rand(2, 5, generator=generator))
+
+    def batches(place, masked, every):
+        arrays = (each.to(place) for each in (rgba, sizes.cumsum(0) - sizes, width, height))
+        store = PixelStore(*arrays, True, mask.to(torch.uint8).to(place) if masked else None)
+        scene = SimpleNamespace(pixels=store, splits={"train": (3, 0, 2)}, depths=depths)
+        made = RayBatches(scene, Progress(), 3, rays, depth_every=every)
+        made.crop_to(0.5, 2, 2)
+        return made
+
+    for masked, every, attempt, seen in ((False, 0, 0, 0), (True, 8, 1, 33 * rays), (True, 3, 0, (1 << 33) + 5)):
+        expected = batches("cpu", masked, every).at(attempt, seen)
+        found = batches(device, masked, every)._in_one_kernel(kernels, attempt, seen, None)
+        assert len(found.tensors()) == (7 if every else 5)
+        for one, other in zip(found.tensors(), expected.tensors(), strict=True):
+            assert torch.equal(one.cpu(), other)
+    assert batches(device, True, 0)._in_one_kernel(kernels, 0, 0, 0).num_rays == 0
 
 
 def check_rays(kernels, device, generator, rays):

@@ -18,7 +18,7 @@ from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, b
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
-from nerf_lightning.nerf.randomness import batch_random, fold, permute, purpose_word
+from nerf_lightning.nerf.randomness import batch_random, purpose_word
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import closed_weights, weights_from_density
@@ -43,12 +43,6 @@ def check_random(kernels, device, generator, rays):
     for count in (1, 3, 65):
         expected = random.along(count).uniform("strata")
         assert torch.equal(kernels.uniform(random.key, random.slots, purpose_word("strata"), count), expected)
-    for first, size in ((0, 1), (7, 3 * rays + 1), ((1 << 33) + 5, 97)):  # within an epoch, and across some
-        place = torch.arange(first, first + rays)
-        keys = torch.tensor([fold(3, "rays", epoch) for epoch in (place // size).tolist()])
-        found = kernels.in_order(first, rays, size, fold(3, "rays"), device)
-        assert torch.equal(found.cpu(), permute(place % size, size, keys))
-    assert kernels.in_order(5, 0, 3, 1, device).shape == (0,)
 
 
 def check_adam(kernels, device, generator, rays):

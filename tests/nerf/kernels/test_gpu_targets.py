@@ -26,14 +26,14 @@ from nerf_lightning.nerf.kernels.ragged import cuda as ragged
 
 KERNELS = {mlp: ["_forward", "_backward"], hash_grid: ["_forward", "_backward"]}
 SMALL = {
-    "random.cuda": ["_uniform", "_in_order"],
+    "random.cuda": ["_uniform"],
     "march.cuda": ["_enter", "_march", "_write"],
     "spherical_harmonics.cuda": ["_harmonics"],
     "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
     "histograms.cuda": ["_sample", "_interlevel", "_distortion"],
     "adam.cuda": ["_update"],
-    "pixels.cuda": ["_locate", "_gather"],
+    "pixels.cuda": ["_batch"],
     "rays.cuda": ["_rays"],
 }
 """What `trial` of each other module launches."""

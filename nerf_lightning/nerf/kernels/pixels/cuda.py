@@ -1,6 +1,9 @@
-"""Pixels of a batch for CUDA: which they are, and what they show. `TRITON_INTERPRET=1` runs it without a GPU."""
+"""Batches of pixels for CUDA in one kernel: which pixels, in keyed order, and what they show.
 
-from typing import no_type_check
+It is `RayBatches.at` for single pixels, bit for bit. `TRITON_INTERPRET=1` runs it without a GPU.
+"""
+
+from typing import NamedTuple, no_type_check
 
 import torch
 import triton
@@ -8,54 +11,97 @@ import triton.language as tl
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-BLOCK = 256
+from nerf_lightning.nerf.kernels.random.cuda import mix
+from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
+
+BLOCK = 64
+"""Few, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
 
 
-def locate(
-    number: Int[Tensor, "*rays"],
-    ends: Int[Tensor, "views"],
-    columns: Int[Tensor, "views"],
-    views: Int[Tensor, "views"],
-    left: Int[Tensor, "views"],
-    top: Int[Tensor, "views"],
-) -> tuple[Int[Tensor, "*rays"], Int[Tensor, "*rays"], Int[Tensor, "*rays"]]:
-    """Return view, column and row of numbered pixels (`data.ray_batches.PixelDomain`).
+class Order(NamedTuple):
+    """Places in a row of things that follow each other anew in each epoch."""
+
+    places: range
+    size: int
+    """Of an epoch, whose order is `randomness.permute` with the key `fold(*parts, epoch)`."""
+    key: int
+    """fold(*parts)."""
+
+
+class Domain(NamedTuple):
+    """The pixels that are numbered (`data.ray_batches.PixelDomain`)."""
+
+    ends: Int[Tensor, "views"]
+    """The number that follows each view's last pixel."""
+    columns: Int[Tensor, "views"]
+    """Pixels in a row of each view that are numbered."""
+    views: Int[Tensor, "views"]
+    """Which view each is."""
+    left: Int[Tensor, "views"]
+    """Column of its first numbered pixel."""
+    top: Int[Tensor, "views"]
+    """Row of it."""
+
+
+class Store(NamedTuple):
+    """What the pixels show (`nerf.types.scene.PixelStore`)."""
+
+    offset: Int[Tensor, "all_views"]
+    width: Int[Tensor, "all_views"]
+    rgba: UInt8[Tensor, "pixels 4"]
+    mask: UInt8[Tensor, "pixels"] | None
+
+
+class Known(NamedTuple):
+    """Pixels whose distance is known (`data.depth_rays.DepthRays`)."""
+
+    view: Int[Tensor, "known"]
+    x: Int[Tensor, "known"]
+    y: Int[Tensor, "known"]
+    distance: Float[Tensor, "known"]
+    certainty: Float[Tensor, "known"]
+
+
+class Pixels(NamedTuple):
+    """Pixels, what they show, and how far that is away."""
+
+    view: Int[Tensor, "rays"]
+    x: Int[Tensor, "rays"]
+    y: Int[Tensor, "rays"]
+    rgba: Float[Tensor, "rays 4"]
+    weight: Float[Tensor, "rays"]
+    distance: Float[Tensor, "rays"] | None = None
+    certainty: Float[Tensor, "rays"] | None = None
+
+
+def batch(rays: Order, domain: Domain, store: Store, of_known: Order | None, known: Known | None) -> Pixels:
+    """Return the pixels at some places of the order of a domain, then those at some places of all of known distance.
 
     Args:
-        number: of the pixels.
-        ends: the number that follows each view's last pixel.
-        columns: pixels in a row of each view that are numbered.
-        views: which view each is.
-        left: column of its first numbered pixel.
-        top: row of it.
+        rays: places in the domain.
+        domain: what is numbered.
+        store: all pixels.
+        of_known: places among those of known distance; None: no distances are asked for.
+        known: these.
     """
-    view, x, y = (torch.empty_like(number, memory_format=torch.contiguous_format) for _ in range(3))
-    count, steps = number.numel(), len(ends).bit_length()
+    device, several = store.rgba.device, len(rays.places)
+    last = Order(range(0), 1, 0) if of_known is None else of_known
+    count = several + len(last.places)
+    view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
+    rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
+    distance, certainty = (None, None) if known is None else (torch.empty_like(weight), torch.empty_like(weight))
     if count:
-        arrays = number.contiguous(), ends, columns, views, left, top, view, x, y
-        _locate[(triton.cdiv(count, BLOCK),)](*arrays, count, len(ends), steps, BLOCK)
-    return view, x, y
-
-
-def gather(
-    view: Int[Tensor, "*rays"],
-    x: Int[Tensor, "*rays"],
-    y: Int[Tensor, "*rays"],
-    offset: Int[Tensor, "views"],
-    width: Int[Tensor, "views"],
-    rgba: UInt8[Tensor, "pixels 4"],
-    mask: UInt8[Tensor, "pixels"] | None,
-) -> tuple[Float[Tensor, "*rays 4"], Float[Tensor, "*rays"]]:
-    """Return colors in [0, 1] and weights of pixels; the arrays are those of `PixelStore`."""
-    colors = torch.empty(*view.shape, 4, device=rgba.device)
-    weight = torch.empty(view.shape, device=rgba.device)
-    count = view.numel()
-    if count:
-        pixels = (each.contiguous() for each in (view, x, y))
-        masks = rgba if mask is None else mask
-        arrays = *pixels, offset, width, rgba, masks, colors, weight
-        _gather[(triton.cdiv(count, BLOCK),)](*arrays, count, mask is not None, BLOCK)
-    return colors, weight
+        _batch[(triton.cdiv(count, BLOCK),)](
+            *(view, x, y, rgba, weight, distance, certainty),
+            *(several, rays.places.start, rays.size, rays.key, *grid_of(rays.size)),
+            *(count, last.places.start, last.size, last.key, *grid_of(last.size)),
+            *(*domain, len(domain.ends), len(domain.ends).bit_length()),
+            *store,
+            *(known or (None,) * len(Known._fields)),
+            FEISTEL_ROUNDS,
+            BLOCK,
+        )
+    return Pixels(view, x, y, rgba, weight, distance, certainty)
 
 
 def trial(device: str = "cuda") -> None:
@@ -65,49 +111,85 @@ def trial(device: str = "cuda") -> None:
         RuntimeError: they compute wrongly.
     """
     ends, views = torch.tensor([[4, 8], [0, 1]], device=device)  # two pictures of 2 x 2
-    view, x, y = locate(ends - 1, ends, 0 * views + 2, views, 0 * views, 0 * views)  # their last pixels
-    rgba = torch.arange(32, device=device).clamp(max=15).view(8, 4).to(torch.uint8)
-    colors, weight = gather(view, x, y, ends - 4, 0 * views + 2, 17 * rgba, None)
-    found = view.tolist(), x.tolist(), y.tolist(), colors[1].tolist(), weight.tolist()
-    if found != ([0, 1], [1, 1], [1, 1], [1.0] * 4, [1.0, 1.0]):
-        raise RuntimeError("a trial of its kernels gave wrong numbers")
+    domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
+    store = Store(ends - 4, 0 * views + 2, rgba.view(8, 4).to(torch.uint8), None)
+    known = Known(views, views, 0 * views, views + 1.5, views + 0.5)
+    found = batch(Order(range(8), 8, 1), domain, store, Order(range(2), 2, 1), known)
+    number = 4 * found.view + 2 * found.y + found.x
+    right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
+    if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):
+        raise RuntimeError("a trial of its kernels gave wrong pixels")
 
 
-@triton.jit
+VARIES = ["several", "first", "key", "count", "known_first", "known_key"]
+"""From step to step: no reason to compile again."""
+
+
+@triton.jit(do_not_specialize=VARIES)
 @no_type_check
-def _locate(number, ends, columns, views, left, top, view, x, y, count, slots, steps, block: tl.constexpr):
+def _batch(
+    out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
+    several, first, size, key, rows, columns,
+    count, known_first, known_size, known_key, known_rows, known_columns,
+    ends, across, views, left, top, slots, steps,
+    offset, width, rgba, mask,
+    known_view, known_x, known_y, known_distance, known_certainty,
+    rounds: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
     index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
-    valid = index < count
-    pixel = tl.load(number + index, mask=valid, other=0)
-    # How many views end before the pixel: halving what is left.
+    valid, is_known = index < count, index >= several
+    # As `randomness.permute`.
+    size = tl.where(is_known, known_size, size).to(tl.int64)
+    rows = tl.where(is_known, known_rows, rows).to(tl.int64)
+    columns = tl.where(is_known, known_columns, columns).to(tl.int64)
+    place = tl.where(is_known, index - several + known_first, index + first)
+    epoch = place // size
+    number = place - epoch * size
+    key = tl.where(is_known, known_key, key).to(tl.uint32)
+    start = mix(key ^ mix(epoch.to(tl.uint32)) ^ 0x5A5A5A5A)
+    walks = valid
+    while tl.max(walks.to(tl.int32), axis=0) > 0:
+        row = number // columns
+        column = number - row * columns
+        for each in tl.static_range(rounds):
+            word = mix((start + each * 0x1B873593).to(tl.uint32))
+            if each % 2:
+                column = (column + mix(word ^ row.to(tl.uint32)).to(tl.int64)) % columns
+            else:
+                row = (row + mix(word ^ column.to(tl.uint32)).to(tl.int64)) % rows
+        number = tl.where(walks, row * columns + column, number)
+        walks = walks & (number >= size)
+    # Of the pixels of a domain: how many views end before each, by halving what is left.
+    numbered = valid & ~is_known
     low, high = tl.zeros([block], tl.int32), tl.full([block], slots, tl.int32)
     for _ in range(steps):
         middle = (low + high) // 2
-        beyond = (low < high) & (tl.load(ends + middle, mask=low < high, other=0) <= pixel)
-        high = tl.where(beyond, high, middle)
+        open = numbered & (low < high)
+        beyond = open & (tl.load(ends + middle, mask=open, other=0) <= number)
+        high = tl.where(open & ~beyond, middle, high)
         low = tl.where(beyond, middle + 1, low)
-    start = tl.load(ends + low - 1, mask=valid & (low > 0), other=0)
-    across = tl.load(columns + low, mask=valid, other=1)
-    row = (pixel - start) // across
-    tl.store(view + index, tl.load(views + low, mask=valid, other=0), mask=valid)
-    tl.store(x + index, pixel - start - row * across + tl.load(left + low, mask=valid, other=0), mask=valid)
-    tl.store(y + index, row + tl.load(top + low, mask=valid, other=0), mask=valid)
-
-
-@triton.jit
-@no_type_check
-def _gather(
-    views, xs, ys, offset, width, rgba, masks, colors, weight, count, masked: tl.constexpr, block: tl.constexpr
-):
-    index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
-    valid = index < count
-    view = tl.load(views + index, mask=valid, other=0)
-    row, column = tl.load(ys + index, mask=valid, other=0), tl.load(xs + index, mask=valid, other=0)
-    flat = tl.load(offset + view, mask=valid, other=0) + row * tl.load(width + view, mask=valid, other=0) + column
+    within = number - tl.load(ends + low - 1, mask=numbered & (low > 0), other=0)
+    side = tl.load(across + low, mask=numbered, other=1)
+    view = tl.load(views + low, mask=numbered, other=0)
+    x = within % side + tl.load(left + low, mask=numbered, other=0)
+    y = within // side + tl.load(top + low, mask=numbered, other=0)
+    if known_view is not None:
+        told = valid & is_known
+        view = tl.where(told, tl.load(known_view + number, mask=told, other=0), view)
+        x = tl.where(told, tl.load(known_x + number, mask=told, other=0), x)
+        y = tl.where(told, tl.load(known_y + number, mask=told, other=0), y)
+    tl.store(out_view + index, view, mask=valid)
+    tl.store(out_x + index, x, mask=valid)
+    tl.store(out_y + index, y, mask=valid)
+    # What they show.
+    flat = tl.load(offset + view, mask=valid, other=0) + y * tl.load(width + view, mask=valid, other=0) + x
     channel, inside = tl.arange(0, 4)[None, :], valid[:, None]
     color = tl.load(rgba + 4 * flat[:, None] + channel, mask=inside, other=0).to(tl.float32)
     tl.store(colors + 4 * index[:, None] + channel, tl.div_rn(color, 255.0), mask=inside)
     kept = tl.full([block], 1.0, tl.float32)
-    if masked:
-        kept = tl.load(masks + flat, mask=valid, other=0).to(tl.float32)
+    if mask is not None:
+        kept = tl.load(mask + flat, mask=valid, other=0).to(tl.float32)
     tl.store(weight + index, kept, mask=valid)
+    if known_view is not None:
+        tl.store(out_distance + index, tl.load(known_distance + number, mask=told, other=1.0), mask=valid)
+        tl.store(out_certainty + index, kept * tl.load(known_certainty + number, mask=told, other=0.0), mask=valid)
