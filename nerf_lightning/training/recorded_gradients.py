@@ -78,20 +78,20 @@ class RecordedGradients:
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
     def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: int) -> StepOutput:
-        """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones."""
+        """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones.
+
+        Both are written over by the next call.
+        """
         kind = batch.num_rays, self.variant()
         if kind not in self.recordings:
             self.recordings[kind] = self._recorded(batch, weight, key)
         kept = self.recordings[kind]
-        for inside, given in zip(kept.batch.tensors(), batch.tensors(), strict=True):
-            inside.copy_(given)
-        kept.weight.copy_(weight)
+        _copy([*kept.batch.tensors(), kept.weight], [*batch.tensors(), weight])
         kept.key.fill_(key)
         kept.replay()
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
-        # The next replay writes over what it has returned.
-        return kept.seen.map(Tensor.clone)
+        return kept.seen
 
     def _recorded(self, batch: Batch, weight: Tensor, key: int) -> _Recording:
         batch, weight = batch.map(Tensor.clone), weight.clone()
@@ -117,3 +117,9 @@ class RecordedGradients:
             if parameter.grad is not None:
                 parameter.grad.zero_()
         return _Recording(batch, weight, kept_key, replay, seen, [parameter.grad for parameter in self.parameters])
+
+
+def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
+    """Copy tensors; those of one type in one kernel."""
+    for dtype in {each.dtype for each in targets}:
+        torch._foreach_copy_(*([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources)))

@@ -11,7 +11,10 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 @dataclass(frozen=True)
 class StepOutput(TensorStruct):
-    """What a step saw of its rays, and what it lost there; detached. Callbacks find it as `outputs["step"]`."""
+    """What a step saw of its rays, and what it lost there; detached. Callbacks find it as `outputs["step"]`.
+
+    Where steps are recorded and replayed, the next one writes over it: clone what is to be kept.
+    """
 
     losses: Float[Tensor, "levels"]
     """Of the whole batch, over all processes; their sum was minimized, with the penalties of parts."""
