@@ -249,9 +249,7 @@ class RayBatches:
             return pixels
         return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
 
-    def _places_at(
-        self, attempt: int, rays_seen: int, batch_rays: int | None
-    ) -> tuple[PixelDomain, str, range, range]:
+    def _places_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> tuple[PixelDomain, str, range, range]:
         """Return the domain of that batch, its name, and places in its order: all of the batch's, this process's."""
         position, count, slots = self._squares_at(rays_seen, batch_rays)
         before = self._num_depths(position)

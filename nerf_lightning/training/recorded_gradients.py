@@ -122,4 +122,5 @@ class RecordedGradients:
 def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
     """Copy tensors; those of one type in one kernel."""
     for dtype in {each.dtype for each in targets}:
-        torch._foreach_copy_(*([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources)))
+        ours, theirs = ([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources))
+        torch._foreach_copy_(ours, theirs)

@@ -108,7 +108,9 @@ class Watch(Callback):
 @pytest.mark.parametrize("resident", [True, False])
 def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, resident, device, tmp_path):
     step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *METHODS[method]).training
-    settings = TrainerSettings(max_steps=STEPS, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=STEPS)
+    settings = TrainerSettings(
+        max_steps=STEPS, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=STEPS
+    )
     system = RadianceFieldSystem(step, {})
     settings.prepare(step.model)
     watch = Watch(device)

@@ -32,6 +32,7 @@ def trial(device: str = "cuda") -> None:
 @triton.jit
 @no_type_check
 def mix(word):
+    """Scramble 32 bits, as `randomness.mix`."""
     word = word ^ (word >> 16)
     word = (word * 0x7FEB352D).to(tl.uint32)
     word = word ^ (word >> 15)
