@@ -84,7 +84,9 @@ def average(tensors: Sequence[Tensor]) -> None:
 
 
 def total(tensor: Tensor) -> Tensor:
-    """Return the sum of a tensor over the ranks."""
+    """Return the sum of a tensor over the ranks; where there is one, the tensor itself."""
+    if world_size() == 1:
+        return tensor
     result = tensor.clone()
     add_up([result])
     return result
