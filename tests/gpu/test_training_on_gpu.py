@@ -49,7 +49,9 @@ def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, de
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")  # torch's, of itself
+# torch's, of itself, and of what checks types in tests.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:Dynamo does not know how to trace:UserWarning")
 def test_compiled_fields_compute_the_same(cuda):
     made = training.Training("nerf_tiny", cuda, "float32", None)
     assert made.step.model.compile_fields()
