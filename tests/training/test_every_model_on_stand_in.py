@@ -65,6 +65,13 @@ def step_and_render(there, run, waits):
     assert bool(run.all_losses().isfinite().all())
 
 
+def losses_on_the_cpu(model):
+    run = step_by_step(model, torch.device("cpu"), "32-true", TILE_POINTS, *small(model))
+    for _ in range(STEPS):
+        run.step()
+    return run.all_losses().tolist()
+
+
 @pytest.mark.parametrize(
     ("model", "precision"), [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in SINGLE]
 )
@@ -75,6 +82,8 @@ def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
         step_and_render(there, run, (*waits, SENT))
     assert there.waited.pop(SENT, 0) <= PHOTOGRAPHS
     assert there.waited == waits
+    if precision == "32-true":
+        assert run.all_losses().tolist() == pytest.approx(losses_on_the_cpu(model), rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,8 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
     """Return what is said of training and rendering, and the operations of training per ray."""
     steps, render_rays = config.steps, config.render_rays
     loaded_steps = LoadedSteps(bench.batches, bench.train_on, steps)
-    threads = [2**k for k in range(num_cores().bit_length())] if config.scaling else []
+    scales = config.scaling and bench.settings.device_type == "cpu"
+    threads = [2**k for k in range(num_cores().bit_length())] if scales else []
     kinds: dict[str, Work] = {
         "matrix": multiplication(bench.settings),
         "train": partial(bench.train, steps),
