@@ -89,8 +89,10 @@ class SlicedRenderer:
     def _slice(self, rays_of: RayGenerator, part: slice, clip: Clip | None) -> tuple[Tensor, Tensor, Tensor]:
         rays, straight = view_rays(rays_of, quads_between(rays_of.cameras, 0, part), clip)
         seen = render_rays(self.model, replace(rays, together=QUAD), self.background, self.tile_points)
-        depth = surface_depth(seen.depth, seen.opacity, rays.far)
-        return seen.rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), seen.opacity
+        far = rays.far.cpu()
+        depth = surface_depth(seen.depth, seen.opacity, far)
+        bent = rays_of.ndc is not None
+        return seen.rgb, world_distance(straight.to("cpu"), depth / far) if bent else depth, seen.opacity
 
     def _rays_in_a_slice(self, left: int) -> int:
         rays = QUAD * max(16, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS / QUAD))

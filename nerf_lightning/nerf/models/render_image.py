@@ -68,7 +68,7 @@ def render_picture(
     """
     cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
 
-    def through(offset: Float[Tensor, "2"], pixels: PixelIndex) -> Picture:
+    def through(offset: Float[Tensor, "2"] | None, pixels: PixelIndex) -> Picture:
         at = (offset, subpixels.per_side)
         rays, straight = view_rays(rays_of, pixels, clip, *at)
         if seen_from is not None:
@@ -77,12 +77,12 @@ def render_picture(
         seen = (_render_tile if clip is None else _render_what_is_left)(model, shown, background)
         if cameras.ndc is not None:
             whole = rays.far if clip is None else view_rays(rays_of, pixels, None, *at)[0].far
-            seen = replace(seen, depth=world_distance(straight, seen.depth / whole))
+            seen = replace(seen, depth=world_distance(straight.to("cpu"), seen.depth / whole.cpu()))
         return seen
 
     def render(part: slice) -> Picture:
         pixels = quads_between(cameras, view, part)
-        first, *others = subpixels.offsets()
+        first, *others = subpixels.offsets() if subpixels.per_pixel > 1 else (None,)  # a kernel knows of no offsets
         total = through(first, pixels)
         for offset in others:
             total = _sum(total, through(offset, pixels))
@@ -101,9 +101,10 @@ def view_rays(
     subpixel_offset: Float[Tensor, "2"] | None = None,
     per_side: int = 1,
 ) -> tuple[RayBundle, RayBundle]:
-    """Return the rays of pixels as the model takes them, and the same rays through the world; both on the CPU.
+    """Return the rays of pixels as the model takes them, and the same rays through the world.
 
-    They take 60 times as much memory as the pixels of a photograph: ask for a tile of a picture at a time.
+    They are where the cameras are; on the CPU where they are clipped. They take 60 times as much memory as the pixels
+    of a photograph: ask for a tile of a picture at a time.
 
     Args:
         rays_of: the cameras.
@@ -113,10 +114,12 @@ def view_rays(
         per_side: so many rays share each side of a pixel.
     """
     subpixel_offset = None if subpixel_offset is None else subpixel_offset.to(pixels.x.device)
-    rays = rays_of(pixels, subpixel_offset, per_side).to("cpu")
-    bent = rays_of.ndc is not None
-    straight = rays_of.through_world(pixels, subpixel_offset).to("cpu") if bent else rays
-    return rays if clip is None else clip(rays, straight, ndc=bent), straight
+    rays, bent = rays_of(pixels, subpixel_offset, per_side), rays_of.ndc is not None
+    straight = rays_of.through_world(pixels, subpixel_offset) if bent else rays
+    if clip is None:
+        return rays, straight
+    rays, straight = rays.to("cpu"), straight.to("cpu")
+    return clip(rays, straight, ndc=bent), straight
 
 
 @torch.no_grad()
@@ -137,7 +140,7 @@ def picture_surface(
     depth, opacity = picture.depth.flatten(), picture.opacity.flatten()
     surface, points = torch.empty_like(depth), torch.empty(len(depth), 3)
     for part in row_chunks(len(depth), 1):
-        rays, straight = view_rays(rays_of, pixels_between(cameras, view, part), clip)
+        rays, straight = (each.to("cpu") for each in view_rays(rays_of, pixels_between(cameras, view, part), clip))
         bent = cameras.ndc is not None
         surface[part] = depth[part] if bent else surface_depth(depth[part], opacity[part], rays.far)
         points[part] = straight.origins + surface[part, None] * straight.directions

@@ -32,7 +32,7 @@ def kernels():
 @pytest.fixture(params=["float32", pytest.param("bfloat16", marks=needs_bfloat16), "bfloat16 by tiles"])
 def dtype(request, kernels, monkeypatch):
     name, *tiled = request.param.split(" by ")
-    if tiled and kernels.KINDS[torch.bfloat16] != amx.KIND:
+    if tiled and not isinstance(kernels.KINDS[torch.bfloat16], type(amx.KIND)):  # zeros of two types are equal
         pytest.skip("this CPU has no AMX, or this process may not use it")
     if name == "bfloat16":
         monkeypatch.setitem(kernels.KINDS, torch.bfloat16, amx.KIND if tiled else np.int32(0))
