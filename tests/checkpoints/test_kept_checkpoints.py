@@ -65,7 +65,7 @@ def test_a_checkpoint_of_a_released_version_renders_as_it_did(file):
     if file.stem == "view_transformer":
         pytest.importorskip("nerf_lightning.extensions.view_transformer", reason="an extension, which is not here")
     expected = json.loads((file.parent / "rendered.json").read_text())[file.stem]
-    assert rendered(file) == pytest.approx(expected, abs=2e-3)
+    assert rendered(file) == pytest.approx(expected, abs=2e-3, rel=1e-3)  # rendered in bfloat16, float32 in places
 
 
 def test_there_is_one_of_each_kind_and_they_are_small():
