@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
+from llvmlite import ir
 from numba import njit
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
@@ -21,6 +24,11 @@ if TYPE_CHECKING:
 POINTS = 64
 """So many are taken at a time: their cells are found by vectors, and then what stands there is fetched. Found one by
 one, in the midst of fetching, they keep a processor from looking ahead to memory."""
+AHEAD = 8
+"""Memory is asked for the entries of a point so many points before they are used. A processor by itself looks ahead
+over two or three, and where a level does not fit into its caches it would wait most of the time."""
+NEAR_BYTES = 1 << 18
+"""Levels up to this size are in the caches anyway."""
 SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 NONE, NEXT = np.int32(0), np.int32(1)
@@ -301,31 +309,68 @@ def _scatter(into, offset, e, w, i, grad, row, column, lanes):
             into[offset + e[k], f] += w[k] * grad[row, column + f]
 
 
+@intrinsic
+def _fetch(context: Any, address: Any) -> Any:
+    """Ask memory for what stands at an address, and do not wait for it."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [place, word, word, word])
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(prefetch, [builder.inttoptr(arguments[0], place), word(0), word(3), word(1)])
+        return context.get_dummy_value()
+
+    return types.void(types.int64), code
+
+
+@njit(fastmath=True)
+@no_type_check
+def _fetch_corners(first, size, e, i):
+    for k in range(8):
+        _fetch(first + size * np.int64(e[k * POINTS + i]))
+
+
+@njit(fastmath=True)
+@no_type_check
+def _is_far(level, offsets, size):
+    return size * (offsets[level + 1] - offsets[level]) > NEAR_BYTES
+
+
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def encode(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
     """Write the features of the points from first to last."""
-    p = np.empty(3 * POINTS, np.float32)
+    p, size = np.empty(3 * POINTS, np.float32), 4 * len(lanes)
     e, w = np.empty(8 * POINTS, np.int32), np.empty(8 * POINTS, np.float32)
     for start in range(first, last, POINTS):
         count = min(POINTS, last - start)
         _take_points(points, start, count, p)
         for level in range(resolutions.shape[0]):
             _find(p, resolutions[level], hashed[level], mask, e, w)
+            entries, is_far = np.int64(table.ctypes.data) + size * offsets[level], _is_far(level, offsets, size)
+            for i in range(AHEAD if is_far else 0):
+                _fetch_corners(entries, size, e, i)
             for i in range(count):
+                if is_far:
+                    _fetch_corners(entries, size, e, min(i + AHEAD, POINTS - 1))
                 _gather(table, offsets[level], e, w, i, out, start + i, level * len(lanes), lanes)
 
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def _add_table_gradient(level, into, points, grad, resolutions, offsets, hashed, mask, lanes):
-    p = np.empty(3 * POINTS, np.float32)
+    p, size = np.empty(3 * POINTS, np.float32), 4 * len(lanes)
     e, w = np.empty(8 * POINTS, np.int32), np.empty(8 * POINTS, np.float32)
+    entries, is_far = np.int64(into.ctypes.data) + size * offsets[level], _is_far(level, offsets, size)
     for start in range(0, points.shape[0], POINTS):
         count = min(POINTS, points.shape[0] - start)
         _take_points(points, start, count, p)
         _find(p, resolutions[level], hashed[level], mask, e, w)
+        for i in range(AHEAD if is_far else 0):
+            _fetch_corners(entries, size, e, i)
         for i in range(count):
+            if is_far:
+                _fetch_corners(entries, size, e, min(i + AHEAD, POINTS - 1))
             _scatter(into, offsets[level], e, w, i, grad, start + i, level * len(lanes), lanes)
 
 
