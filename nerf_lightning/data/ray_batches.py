@@ -218,19 +218,13 @@ class RayBatches:
 
     def _in_one_kernel(self, kernels: ModuleType, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
         domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
-        store, of_known, known = self.scene.pixels, None, None
-        if self.depths is not None:
-            told, key = self.depths.depths, fold(self.seed, attempt, "depths")
-            of_known = kernels.Order(self._depth_places_at(rays_seen, batch_rays), len(self.depths), key)
-            known = kernels.Known(told.pixels.view, told.pixels.x, told.pixels.y, told.distance, told.certainty)
-        view, x, y, *shown = kernels.batch(
-            kernels.Order(places, len(domain), fold(self.seed, attempt, purpose)),
-            kernels.Domain(domain.ends, domain.width, domain.views, domain.left, domain.top),
-            kernels.Store(store.offset, store.width, store.rgba, store.mask),
-            of_known,
-            known,
-        )
-        return Batch(PixelIndex(view, x, y), *shown)
+        rays = kernels.Order(places, len(domain), fold(self.seed, attempt, purpose))
+        numbered = kernels.Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
+        if self.depths is None:
+            return kernels.batch(rays, numbered, self.scene.pixels)
+        among, key = self._depth_places_at(rays_seen, batch_rays), fold(self.seed, attempt, "depths")
+        of_known = kernels.Order(among, len(self.depths), key)
+        return kernels.batch(rays, numbered, self.scene.pixels, self.depths.depths, of_known)
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""

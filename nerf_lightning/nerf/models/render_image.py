@@ -118,7 +118,8 @@ def view_rays(
     straight = rays_of.through_world(pixels, subpixel_offset) if bent else rays
     if clip is None:
         return rays, straight
-    rays, straight = rays.to("cpu"), straight.to("cpu")
+    rays = rays.to("cpu")
+    straight = straight.to("cpu") if bent else rays
     return clip(rays, straight, ndc=bent), straight
 
 
@@ -140,10 +141,10 @@ def picture_surface(
     depth, opacity = picture.depth.flatten(), picture.opacity.flatten()
     surface, points = torch.empty_like(depth), torch.empty(len(depth), 3)
     for part in row_chunks(len(depth), 1):
-        rays, straight = (each.to("cpu") for each in view_rays(rays_of, pixels_between(cameras, view, part), clip))
+        rays, straight = view_rays(rays_of, pixels_between(cameras, view, part), clip)
         bent = cameras.ndc is not None
-        surface[part] = depth[part] if bent else surface_depth(depth[part], opacity[part], rays.far)
-        points[part] = straight.origins + surface[part, None] * straight.directions
+        surface[part] = depth[part] if bent else surface_depth(depth[part], opacity[part], rays.far.cpu())
+        points[part] = straight.origins.cpu() + surface[part, None] * straight.directions.cpu()
     return surface.view(picture.depth.shape), points.view(picture.rgb.shape)
 
 

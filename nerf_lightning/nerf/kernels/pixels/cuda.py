@@ -8,11 +8,13 @@ from typing import NamedTuple, no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.random.cuda import mix
 from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
+from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
+from nerf_lightning.nerf.types.scene import PixelStore
 
 BLOCK = 64
 """Few, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
@@ -43,50 +45,23 @@ class Domain(NamedTuple):
     """Row of it."""
 
 
-class Store(NamedTuple):
-    """What the pixels show (`nerf.types.scene.PixelStore`)."""
-
-    offset: Int[Tensor, "all_views"]
-    width: Int[Tensor, "all_views"]
-    rgba: UInt8[Tensor, "pixels 4"]
-    mask: UInt8[Tensor, "pixels"] | None
+NOWHERE = Order(range(0), 1, 0)
 
 
-class Known(NamedTuple):
-    """Pixels whose distance is known (`data.depth_rays.DepthRays`)."""
-
-    view: Int[Tensor, "known"]
-    x: Int[Tensor, "known"]
-    y: Int[Tensor, "known"]
-    distance: Float[Tensor, "known"]
-    certainty: Float[Tensor, "known"]
-
-
-class Pixels(NamedTuple):
-    """Pixels, what they show, and how far that is away."""
-
-    view: Int[Tensor, "rays"]
-    x: Int[Tensor, "rays"]
-    y: Int[Tensor, "rays"]
-    rgba: Float[Tensor, "rays 4"]
-    weight: Float[Tensor, "rays"]
-    distance: Float[Tensor, "rays"] | None = None
-    certainty: Float[Tensor, "rays"] | None = None
-
-
-def batch(rays: Order, domain: Domain, store: Store, of_known: Order | None, known: Known | None) -> Pixels:
+def batch(
+    rays: Order, domain: Domain, store: PixelStore, known: KnownDepths | None = None, of_known: Order = NOWHERE
+) -> Batch:
     """Return the pixels at some places of the order of a domain, then those at some places of all of known distance.
 
     Args:
         rays: places in the domain.
         domain: what is numbered.
         store: all pixels.
-        of_known: places among those of known distance; None: no distances are asked for.
-        known: these.
+        known: those whose distance is known; None: no distances are asked for.
+        of_known: places among them.
     """
     device, several = store.rgba.device, len(rays.places)
-    last = Order(range(0), 1, 0) if of_known is None else of_known
-    count = several + len(last.places)
+    count = several + len(of_known.places)
     view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
     rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
     distance, certainty = (None, None) if known is None else (torch.empty_like(weight), torch.empty_like(weight))
@@ -94,14 +69,14 @@ def batch(rays: Order, domain: Domain, store: Store, of_known: Order | None, kno
         _batch[(triton.cdiv(count, BLOCK),)](
             *(view, x, y, rgba, weight, distance, certainty),
             *(several, rays.places.start, rays.size, rays.key, *grid_of(rays.size)),
-            *(count, last.places.start, last.size, last.key, *grid_of(last.size)),
+            *(count, of_known.places.start, of_known.size, of_known.key, *grid_of(of_known.size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
-            *store,
-            *(known or (None,) * len(Known._fields)),
+            *(store.offset, store.width, store.rgba, store.mask),
+            *([None] * 5 if known is None else known.tensors()),
             FEISTEL_ROUNDS,
             BLOCK,
         )
-    return Pixels(view, x, y, rgba, weight, distance, certainty)
+    return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
 
 
 def trial(device: str = "cuda") -> None:
@@ -112,10 +87,10 @@ def trial(device: str = "cuda") -> None:
     """
     ends, views = torch.tensor([[4, 8], [0, 1]], device=device)  # two pictures of 2 x 2
     domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
-    store = Store(ends - 4, 0 * views + 2, rgba.view(8, 4).to(torch.uint8), None)
-    known = Known(views, views, 0 * views, views + 1.5, views + 0.5)
-    found = batch(Order(range(8), 8, 1), domain, store, Order(range(2), 2, 1), known)
-    number = 4 * found.view + 2 * found.y + found.x
+    store = PixelStore(rgba.view(8, 4).to(torch.uint8), ends - 4, 0 * views + 2, 0 * views + 2, has_transparency=True)
+    known = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
+    found = batch(Order(range(8), 8, 1), domain, store, known, Order(range(2), 2, 1))
+    number = 4 * found.pixels.view + 2 * found.pixels.y + found.pixels.x
     right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
     if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):
         raise RuntimeError("a trial of its kernels gave wrong pixels")
