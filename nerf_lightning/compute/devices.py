@@ -111,10 +111,12 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
                 f"NERF_LIGHTNING_PRECISION={meant} in the environment is not a precision: use one "
                 f"of {', '.join(get_args(Precision))}, or unset it."
             )
-        return choose_precision(cast(Precision, meant), device_type)[0], "as NERF_LIGHTNING_PRECISION says"
-    if asked == "auto":
+        precision, reason = cast(Precision, meant), "as NERF_LIGHTNING_PRECISION says"
+    else:
+        precision, reason = asked, "as asked"
+    if precision == "auto":
         return ("bf16-mixed", NATIVE) if has_native_bfloat16(device_type) else ("32-true", "no native bfloat16")
-    if asked == "tf32" and not has_tf32(device_type):
+    if precision == "tf32" and not has_tf32(device_type):
         raise InputError(
             "trainer.precision=tf32: TensorFloat-32 needs an NVIDIA GPU of the Ampere generation (2020) or later, "
             "which this device is not. Use trainer.precision=32-true, or auto."
@@ -122,7 +124,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
     if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
         instead = "float32 is used instead" if device_type == "cuda" else "it is emulated, slowly"
         log.warning("trainer.precision=%s: this device has no native bfloat16, so %s.", asked, instead)
-    return asked, "as asked"
+    return precision, reason
 
 
 def suited(precision: Chosen, reason: str, device_type: DeviceType, model: Model) -> tuple[Chosen, str]:

@@ -34,13 +34,14 @@ def test_precision_and_device_follow_the_machine_with_their_reasons(native, monk
     assert devices.has_native_bfloat16("cpu") in (True, False)
 
 
-def test_the_environment_says_what_auto_means(native, monkeypatch):
+def test_the_environment_says_what_auto_means(native, monkeypatch, caplog):
     for answer, meant in ((True, "32-true"), (False, "bf16-mixed")):
         native(answer)
         monkeypatch.setenv("NERF_LIGHTNING_PRECISION", meant)
         settings = TrainerSettings(accelerator="cpu")
         assert (settings.precision, settings.reason) == (meant, "as NERF_LIGHTNING_PRECISION says")
         other = "32-true" if meant == "bf16-mixed" else "bf16-mixed"
+        assert "emulated" not in caplog.text  # who tries another machine knows
         assert TrainerSettings(accelerator="cpu", precision=other).precision == other  # what is asked for is taken
     monkeypatch.setenv("NERF_LIGHTNING_PRECISION", "half")
     with pytest.raises(InputError, match=r"NERF_LIGHTNING_PRECISION=half .* use one of auto, 32-true"):
