@@ -293,10 +293,7 @@ class TrainStep:
         self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
         share = self._share(ranks.total(batch.weight.sum()))
-        if self._recorded is None:
-            seen = self.gradients(batch, backward, share)
-        else:
-            seen = self._replayed(self._recorded, batch, backward, share)
+        seen = self.gradients_of_step(batch, backward, share)
         ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
         ranks.add_up_gradients(parameter for _, parameter in self._named_parameters())
         norms: dict[str, Tensor] = {}
@@ -315,9 +312,13 @@ class TrainStep:
                 )
         return replace(seen, gradient_norms=norms)
 
-    def _replayed(self, recorded: RecordedGradients, batch: Batch, backward: Backward, share: Share) -> StepOutput:
+    def gradients_of_step(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> StepOutput:
+        """Do what `gradients` does, by a replay where steps are recorded."""
+        if self._recorded is None:
+            return self.gradients(batch, backward, share)
+        weight = batch.weight.sum() if share is None else share.weight
         try:
-            return recorded(batch, share.weight, self._key)
+            return self._recorded(batch, weight, self._key)
         except RuntimeError as error:
             if not is_out_of_memory(error) and "captur" not in str(error):
                 raise

@@ -4,8 +4,8 @@
 kernel, no screening of what lies behind opaque samples.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,6 +26,12 @@ from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.tile_size import measured_tile
+
+# Without these, torch computes around the kernel of hash grids.
+TWINS = (
+    *("march.cpu", "ragged.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"),
+    *("march.cuda", "ragged.cuda", "mlp.cuda", "adam.cuda", "render.cuda"),
+)
 
 
 @dataclass
@@ -48,18 +54,30 @@ class Bench:
         """The batch that every kind gets, as large as batches are once the model has been trained."""
         return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
 
-    def train(self, steps: int, plain: bool = False) -> None:
+    def train(self, steps: int) -> None:
         """Take steps on the one batch."""
-        with self._plainly() if plain else nullcontext():
+        for _ in range(steps):
+            self.train_on(self.batch)
+
+    def train_on(self, batch: Batch) -> None:
+        """Compute gradients, by a replay where training replays, and update; nothing else."""
+        self._update(self.optimizer, lambda: self.step.gradients_of_step(batch))
+
+    def train_one_by_one(self, steps: int) -> None:
+        """Take steps on the one batch whose kernels are launched one by one."""
+        for _ in range(steps):
+            self._update(self.optimizer, lambda: self.step.gradients(self.batch))
+
+    def train_plainly(self, steps: int) -> None:
+        """Take steps on the one batch as one would first write them."""
+        with self._plainly():
             for _ in range(steps):
-                self.train_on(self.batch, plain)
+                self._update(self.plain_optimizer, lambda: self.step.gradients(self.batch))
         self.step.tile_points = self.settings.tile_points
 
-    def train_on(self, batch: Batch, plain: bool = False) -> None:
-        """Compute gradients and update, and nothing else."""
-        optimizer = self.plain_optimizer if plain else self.optimizer
+    def _update(self, optimizer: torch.optim.Optimizer, gradients: Callable[[], object]) -> None:
         optimizer.zero_grad()
-        self.step.gradients(batch)
+        gradients()
         optimizer.step()
 
     def take_step(self) -> None:
@@ -90,7 +108,7 @@ class Bench:
         for sampler in samplers:
             sampler.opaque_below = 0.0
         self._release_gradients()
-        with without("march.cpu", "ragged.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"):
+        with without(*TWINS):
             yield
         self.settings.prepare(model)
         for sampler, value in zip(samplers, former, strict=True):
@@ -113,7 +131,9 @@ def prepare(config: DictConfig, scene: Scene) -> Bench:
     settings.prepare(step.model)
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
     data.settle(settings.device)
-    if settings.measures_tile:
+    if settings.records(step):
+        step.record_gradients()
+    elif settings.measures_tile:
         settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)
     optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
     return Bench(settings, step, data, optimizer, plain)

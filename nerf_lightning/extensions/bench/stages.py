@@ -18,10 +18,11 @@ from nerf_lightning.training.step import TrainStep
 def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
     """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing.
 
-    Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest.
+    Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest. Neither has a
+    step that is replayed.
     """
     level = next((part for part in step.model.modules() if isinstance(part, RaggedLevel)), None)
-    if level is None:
+    if level is None or step.records:
         return {}
     rays, sampler = step.rays(batch.pixels), level.sampler
     optimizer.zero_grad()
@@ -81,7 +82,8 @@ def flops_per_ray(step: TrainStep, batch: Batch) -> float:
     # Where rays differ in their samples, many make the mean.
     few = 8 if step.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
-    kernels = "mlp.cpu", "render.gradients", "render.dense"  # it sees torch's own operations, of its own thread
+    # It sees torch's own operations, of its own thread.
+    kernels = "mlp.cpu", "mlp.cuda", "render.gradients", "render.dense"
     with torch_threads(1), FlopCounterMode(display=False) as counter, without(*kernels):
         step.gradients(rays)
     return counter.get_total_flops() / few

@@ -1,9 +1,9 @@
 """Measure training and rendering speed, compared with plain PyTorch and with the machine's matrix rate.
 
 Medians of ratios: machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are
-compared round by round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32
-without tiles, the machine's matrix product, making a batch, the configured step with batches from the loader, and
-rendering.
+compared round by round. Kinds: the configured step (tiled or replayed, in the configured precision), the same step in
+plain float32 without tiles, a replayed step with its kernels launched one by one, the machine's matrix product, making
+a batch, the configured step with batches from the loader, and rendering.
 """
 
 from collections.abc import Callable, Mapping
@@ -101,11 +101,12 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
     kinds: dict[str, Work] = {
         "matrix": multiplication(bench.settings),
         "train": partial(bench.train, steps),
-        "train_plain": partial(bench.train, steps, plain=True),
+        "train_plain": partial(bench.train_plainly, steps),
         "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
         "loaded": loaded_steps,
         "render": partial(bench.render, render_rays),
         "render_plain": partial(bench.render, render_rays, plain=True),
+        **({"one by one": partial(bench.train_one_by_one, steps)} if bench.step.records else {}),
         **{f"train on {count}": partial(_on_threads, count, partial(bench.train, steps)) for count in threads},
     }
     seconds = _interleaved(kinds, config.rounds)
@@ -124,6 +125,8 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "rendering rays/s": render_rays / seconds["render"],
         "rendering, times plain float32": seconds["render_plain"] / seconds["render"],
     }
+    if bench.step.records:
+        rows["training, times kernels launched one by one"] = seconds["one by one"] / train
     stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
     for name in stages[0]:
         rows[f"{name}, share of a step"] = np.array([each[name] for each in stages]) * steps / train

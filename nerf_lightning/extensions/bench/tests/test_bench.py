@@ -1,9 +1,17 @@
 """`nerf bench`: what it measures, and where it writes it."""
 
 import json
+from functools import partialmethod
 
 import torch
 from support.running import FAST_PATH, said
+from support.tape import tape
+
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
+from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
 
 
 def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
@@ -23,6 +31,24 @@ def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
     assert measured["training on 2 threads, times one"]["median"] > 0
     assert "share of a step that takes one thread alone" in measured
     assert measured["training_flops_per_ray"] > 0
+
+
+def test_bench_replays_what_training_would_replay(nerf, tmp_path, monkeypatch):
+    """`support.tape` stands for CUDA graphs, with the torch twins of the kernels."""
+    monkeypatch.setattr(TrainerSettings, "records", lambda settings, step: True)
+    monkeypatch.setattr(TrainStep, "record_gradients", partialmethod(TrainStep.record_gradients, record=tape))
+    monkeypatch.setattr(OccupancySampler, "capacity_for", lambda sampler, rays: 8192)
+    with without(*CPU_BACKENDS), torch_on_one_thread():
+        result = nerf(
+            "bench", "scene.resolution=16", "scene.num_train=4", "scene.num_val=1", "scene.num_test=1",
+            f"scene.cache_dir={tmp_path}/cache", *FAST_PATH, "rounds=1", "warmup_steps=2", "render_rays=64",
+            "scaling=false", f"paths.output_dir={tmp_path}/bench",
+        )  # fmt: skip
+    assert result.code == 0, result.err
+    measured = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    assert measured["training, times kernels launched one by one"]["median"] > 0
+    assert measured["training_flops_per_ray"] > 0
+    assert not [name for name in measured if name.startswith("march")]  # a replay has no stages
 
 
 def test_a_group_of_training_is_told_where_it_belongs(nerf):
