@@ -23,7 +23,7 @@ from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.losses.mse import squared_error
+from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
@@ -452,7 +452,7 @@ class TrainStep:
             levels = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
             part = (tile.stop - tile.start) / share.num_rays
             with torch.no_grad():
-                errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
+                errors = squared_errors(shown, target[tile])
             terms = {name: values.detach() for name, values in terms.items()}
             if part < 1.0:
                 levels, errors = levels * part, errors * part

@@ -23,6 +23,7 @@ from nerf_lightning.nerf.rendering.histograms import sample_histogram
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import closed_weights, weights_from_density
 from nerf_lightning.nerf.rendering.sample_points import points_along, ragged_points
+from nerf_lightning.nerf.samplers.stratified import stratified_edges
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -169,6 +170,12 @@ def check_histograms(kernels, device, generator, rays):
         torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
         found[:, 1] = edges[:, 1]  # edges that are equal
         _check_losses(kernels, edges, weights, found.sort(dim=-1).values, contracted, generator)
+        jitter = torch.rand(rays, count - 2, generator=generator).sub(0.5).div(count).to(device)
+        ends = torch.rand(2, rays, generator=generator).sort(dim=0).values.mul(0.999999).to(device)
+        for moved in (None, jitter):
+            given = torch.linspace(0, 1, count, device=device), moved, *ends
+            expected = stratified_edges(*(None if each is None else each.double() for each in given), contracted)
+            torch.testing.assert_close(kernels.stratified(*given, contracted).double(), expected, rtol=1e-4, atol=1e-6)
 
 
 def _check_losses(kernels, outer, v, inner, contracted, generator):

@@ -1,5 +1,7 @@
 """The photometric loss of the original NeRF (Eq. 6, arXiv 2003.08934)."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,9 +17,11 @@ class MeanSquaredError(Loss):
 
     def forward(self, renderings: list[Rendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return the weighted mean over rays and channels, per level."""
-        return {"color": torch.stack([squared_error(rendering.rgb, target) for rendering in renderings])}
+        return {"color": squared_errors(renderings, target)}
 
 
-def squared_error(rgb: Float[Tensor, "rays 3"], target: Target) -> Float[Tensor, ""]:
-    """Return the mean squared error of colors, weighted over rays, over rays and channels."""
-    return (mse_loss(rgb, target.rgb, reduction="none") * target.weight[..., None]).mean()
+def squared_errors(renderings: Sequence[Rendering], target: Target) -> Float[Tensor, "levels"]:
+    """Return each level's mean squared error of colors over rays, which are weighted, and channels."""
+    rgb = torch.stack([rendering.rgb for rendering in renderings])
+    errors = mse_loss(rgb, target.rgb.expand_as(rgb), reduction="none")
+    return (errors * target.weight[..., None]).mean(dim=(1, 2))

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.losses.mse import squared_error
+from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.types.rays import Target
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -43,7 +43,7 @@ class ProposalLoss(Loss):
         before = [none] * len(bounds)
         terms = {
             "interlevel": torch.stack([*bounds, none]),
-            "color": torch.stack([*before, squared_error(last.rgb, target)]),
+            "color": torch.stack([*before, *squared_errors([last], target)]),
         }
         if self.distortion:
             spread = self.distortion * (distortion_loss(last) * weight).mean()

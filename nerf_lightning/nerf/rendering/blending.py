@@ -62,8 +62,7 @@ def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] 
     """
     if background is None:
         return rgba[..., :3]
-    alpha = rgba[..., 3:]
-    return rgba[..., :3] * alpha + background * (1.0 - alpha)
+    return torch.lerp(background, rgba[..., :3], rgba[..., 3:])
 
 
 def in_other_light(

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
@@ -68,7 +68,7 @@ def stratified_edges(
         high: where each ray ends.
         contracted: whether `low` and `high` are normalized distances.
     """
-    kernels: Any = cpu_backend("histograms.cpu", low.device) if low.dim() == 1 and low.dtype == torch.float32 else None
+    kernels: Any = backend_for("histograms", low.device) if low.dim() == 1 and low.dtype == torch.float32 else None
     if kernels is not None and not (low.requires_grad or high.requires_grad):
         return kernels.stratified(shares, jitter, low, high, contracted)
     s = shares.expand(*low.shape, -1)

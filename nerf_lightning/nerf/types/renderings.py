@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -57,10 +58,10 @@ class Rendering(TensorStruct):
         """
         escaped = 1.0 - opacity
         return cls(
-            rgb=foreground if background is None else foreground + escaped[..., None] * background,
+            rgb=foreground if background is None else torch.addcmul(foreground, escaped[..., None], background),
             foreground=foreground,
             opacity=opacity,
-            depth=depth + escaped * rays.far,
+            depth=torch.addcmul(depth, escaped, rays.far),
             **of_the_kind,
         )
 

@@ -31,7 +31,7 @@ SMALL = {
     "spherical_harmonics.cuda": ["_harmonics"],
     "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
-    "histograms.cuda": ["_sample", "_interlevel", "_distortion"],
+    "histograms.cuda": ["_sample", "_stratified", "_interlevel", "_distortion"],
     "adam.cuda": ["_update"],
     "pixels.cuda": ["_batch"],
     "rays.cuda": ["_rays"],

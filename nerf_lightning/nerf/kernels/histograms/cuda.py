@@ -39,6 +39,24 @@ def sample(
     return out
 
 
+def stratified(
+    shares: Float[Tensor, "edges"],
+    jitter: Float[Tensor, "rays inner"] | None,
+    low: Float[Tensor, "rays"],
+    high: Float[Tensor, "rays"],
+    contracted: bool,
+) -> Float[Tensor, "rays edges"]:
+    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
+    rays, count = len(low), len(shares)
+    out = torch.empty(rays, count, device=low.device)
+    if rays:
+        shift = shares if jitter is None else jitter  # which is not looked at where there is none
+        arrays = shares.contiguous(), shift.contiguous(), low.contiguous(), high.contiguous(), out
+        block = triton.next_power_of_2(count)
+        _stratified[(rays,)](*arrays, TINY, count, jitter is not None, contracted, block, num_warps=_warps(block))
+    return out
+
+
 def interlevel(
     t: Float[Tensor, "rays edges"],
     w: Float[Tensor, "rays samples"],
@@ -60,6 +78,7 @@ def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]], device=device), torch.ones(1, 2, device=device)
     found = sample(edges, weights, torch.full((1, 1), 0.5, device=device), 0.01, False)
+    stratified(edges[0], edges[:, :1], edges[:, 0], edges[:, 2], True)
     interlevel(edges, weights, edges, weights)
     distortion(edges, weights, True)
     if abs(float(found) - 1.0) > 1e-5:
@@ -90,6 +109,28 @@ def _spaced(distance, contracted: tl.constexpr):
 
 @triton.jit
 @no_type_check
+def _distance(spaced, tiny, contracted: tl.constexpr):
+    """Back again: `geometry.contraction.from_normalized_distance`."""
+    if contracted:
+        spaced = tl.where(spaced < 0.5, 2.0 * spaced, 0.5 / tl.maximum(1.0 - spaced, tiny))
+    return spaced
+
+
+@triton.jit
+@no_type_check
+def _stratified(
+    shares, shift, low, high, out, tiny, count, jittered: tl.constexpr, contracted: tl.constexpr, block: tl.constexpr
+):
+    ray, k = tl.program_id(0).to(tl.int64), tl.arange(0, block)
+    share = tl.load(shares + k, mask=k < count, other=0.0)
+    if jittered:  # the first and the last stay
+        share += tl.load(shift + ray * (count - 2) + k - 1, mask=(k > 0) & (k < count - 1), other=0.0)
+    begin, end = tl.load(low + ray), tl.load(high + ray)
+    tl.store(out + ray * count + k, _distance(begin + share * (end - begin), tiny, contracted), mask=k < count)
+
+
+@triton.jit
+@no_type_check
 def _sample(
     edges, weights, u, out, floor, tiny, bins, count, contracted: tl.constexpr, block: tl.constexpr, lanes: tl.constexpr
 ):
@@ -113,9 +154,7 @@ def _sample(
         high = tl.sum(tl.where(mine, right[None, :], 0.0), axis=1)
         part = tl.where(span > 0.0, (wanted - first) / tl.where(span > 0.0, span, 1.0), 0.5)
         at = low + tl.minimum(tl.maximum(part, 0.0), 1.0) * (high - low)
-        if contracted:  # back again: `from_normalized_distance`
-            at = tl.where(at < 0.5, 2.0 * at, 0.5 / tl.maximum(1.0 - at, tiny))
-        tl.store(out + ray * count + k, at, mask=k < count)
+        tl.store(out + ray * count + k, _distance(at, tiny, contracted), mask=k < count)
 
 
 @triton.jit
