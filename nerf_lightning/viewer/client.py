@@ -50,6 +50,7 @@ class ViewerClient:
         self.picture: UInt8[Tensor, "height width 3"] | None = None
         """What was sent last."""
         self._wants_present, self._presenting = False, threading.Lock()
+        self._looking = threading.Lock()
 
     def start(self) -> None:
         """Follow the camera from now on; there is a picture at once."""
@@ -62,8 +63,9 @@ class ViewerClient:
         camera = self.client.camera
         self._notice_leaving()
         self.on_move()
-        width, height = (min(max(1, int(side)), MOST_SIDE) for side in (camera.image_width, camera.image_height))
-        self.refinement.ask(CameraState(self.pose(), float(camera.fov), width, height, self.crop, self.photograph))
+        with self._looking:  # else a thread that read the camera before it moved could wish last
+            width, height = (min(max(1, int(side)), MOST_SIDE) for side in (camera.image_width, camera.image_height))
+            self.refinement.ask(CameraState(self.pose(), float(camera.fov), width, height, self.crop, self.photograph))
         self.queue.wake()
 
     def pose(self) -> Tensor:

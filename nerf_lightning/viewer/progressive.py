@@ -41,6 +41,8 @@ class ProgressiveRendering:
         self.served = 0.0
         """When it last had a turn (queue's clock)."""
         self._job: Job | None = None
+        self._tried: CameraState | None = None
+        """Of the last job."""
 
     def ask(self, look: CameraState) -> None:
         """Wish for another look."""
@@ -51,11 +53,9 @@ class ProgressiveRendering:
         self.is_stale = True
 
     def give_up(self) -> None:
-        """Drop what could not be rendered, and wait for another wish."""
-        failed = self.wish if self._job is None else self._job.look
-        if self.wish is failed:
-            self.wish = self.shown = None
-        self._job = None
+        """Drop what could not be rendered or shown, and wait for another wish, or for another model."""
+        self.shown, self.shown_height = self._tried, self.most_height
+        self._job, self.is_stale = None, False
 
     @property
     def is_moving(self) -> bool:
@@ -80,7 +80,7 @@ class ProgressiveRendering:
         return True
 
     def _next_job(self, renderer: SlicedRenderer) -> Job | None:
-        look = self.wish
+        look = self._tried = self.wish
         if look is None:
             return None
         full = self._full_height(look)

@@ -1,7 +1,9 @@
 """The panel: what is saved where it can be, and what is not there is said."""
 
 import re
+import threading
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -53,6 +55,30 @@ def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):
         panel.set("Look through", "0: ball_0")
     assert caplog.text.count("ZeroDivisionError") == 1
     assert "Traceback" not in caplog.text
+
+
+def test_the_last_movement_wins_over_one_that_is_still_being_read(tmp_path):
+    panel = Panel(tmp_path)
+    session, plain, read, go = panel.session, panel.session.pose, threading.Event(), threading.Event()
+
+    def slow():
+        session.pose = plain
+        old = plain()
+        read.set()
+        assert go.wait(20)
+        return old
+
+    session.pose, session.on_move = slow, lambda: None
+    threads = [threading.Thread(target=session.look) for _ in range(2)]
+    threads[0].start()
+    assert read.wait(20)
+    panel.client.camera.position = np.array([1.0, 2.0, 3.0])
+    threads[1].start()
+    threads[1].join(0.2)
+    go.set()
+    for each in threads:
+        each.join()
+    assert session.refinement.wish.c2w[:, 3].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_the_crop_box_is_the_scenes(tmp_path):

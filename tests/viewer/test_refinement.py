@@ -80,6 +80,22 @@ def test_who_never_stops_moving_still_sees_pictures(refinement, seen):
     assert {height for _, height, _ in seen} == {MOVING}
 
 
+def test_what_cannot_be_rendered_is_tried_again_with_another_model_and_a_wish_meanwhile_is_not_lost(refinement, seen):
+    refinement.ask(a_look())
+    refinement.work(FakeRenderer())
+    refinement.give_up()
+    assert work_out(refinement) == 0
+    refinement.refresh()
+    work_out(refinement)
+    assert [height for _, height, _ in seen] == [300]
+    refinement.ask(a_look())
+    refinement.work(FakeRenderer())
+    refinement.ask(wished := a_look())
+    refinement.give_up()
+    work_out(refinement)
+    assert [look is wished for look, _, _ in seen[1:]] == [True] * 4
+
+
 def test_a_refreshed_view_is_rendered_once_more_at_its_finest(refinement, seen):
     refinement.ask(a_look())
     work_out(refinement)

@@ -53,7 +53,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
     job.system.step.forget_recordings()
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
-        log.info("%d steps in %s", steps, spoken(job.clock.seconds))
+        log.info("%d step%s in %s", steps, "s" * (steps != 1), spoken(job.clock.seconds))
     if job.signals.received is not None:
         log.info("stopped at step %d; resume with: %s", trainer.global_step, resume_command(folder.path))
         raise SystemExit(128 + job.signals.received)
