@@ -20,12 +20,13 @@ from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
-from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.resume import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
+from nerf_lightning.training.step_output import StepOutput
+from nerf_lightning.training.steps_in_a_row import StepsInARow, logs_for
 
 
 class RadianceFieldSystem(LightningModule):
@@ -80,20 +81,28 @@ class RadianceFieldSystem(LightningModule):
             InputError: it has none, or the trainer cannot fit this system.
         """
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
+        self.in_a_row = StepsInARow(self.trainer, self)
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
 
+        Where steps are replayed, it goes on until somebody looks at one (`StepsInARow`).
+
         Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
         """
-        watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
-        seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
+        seen, taken = self._take_step(batch), 1
+        while self.in_a_row.another(taken):
+            seen, taken = self._take_step(self.in_a_row.batch()), taken + 1
         loss = seen.losses.sum()
-        if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
+        if not logs_for(self.trainer):
             # What is on a bar is read in each step, for which the device is waited for.
             on_bar = self.trainer.progress_bar_callback is not None
             self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=on_bar)
         return {"loss": loss, "step": seen}
+
+    def _take_step(self, batch: Batch) -> StepOutput:
+        watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
+        return self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
 
     def monitors(self) -> list[Monitor]:
         """Return the callbacks that log scalars."""

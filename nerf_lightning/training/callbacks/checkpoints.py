@@ -40,6 +40,10 @@ class Checkpoints(Callback):
         """
         writer(trainer, self)
 
+    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
+        """Tell whether it is time for a checkpoint."""
+        return trainer.global_step % self.every_steps == 0
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Write `last.ckpt` when it is time.
 
@@ -47,7 +51,7 @@ class Checkpoints(Callback):
             InputError: an earlier one could not be written.
         """
         writer(trainer, self).raise_failure()
-        if trainer.global_step % self.every_steps == 0 and pl_module.step.all_finite():
+        if self.is_due(trainer, pl_module) and pl_module.step.all_finite():
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:

@@ -61,6 +61,10 @@ class TrainingProgress(ProgressBar):
         self.task = self.bar.add_task("", total=pl_module.step.num_steps, completed=trainer.global_step)
         self.bar.start()
 
+    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
+        """It can wait for others (`StepsInARow`)."""
+        return False
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step

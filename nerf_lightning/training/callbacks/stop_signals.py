@@ -38,6 +38,10 @@ class StopSignals(Callback):
             trainer._signal_connector.received_sigterm = False
             self.received = signal.SIGTERM
 
+    def is_due(self, trainer: Trainer, pl_module: LightningModule) -> bool:
+        """Tell whether a signal was received."""
+        return self.received is not None
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:

@@ -54,6 +54,10 @@ class TimeBudget(Callback):
         else:
             self.first = pl_module.step.progress.step
 
+    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
+        """Tell whether it is time to estimate the length of the run; the first step alone is not counted."""
+        return self.compiles or pl_module.step.progress.step % self.every_steps == 0
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
