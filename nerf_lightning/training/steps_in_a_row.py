@@ -39,19 +39,21 @@ class StepsInARow:
             and logs_for(trainer)
             and isinstance(data, RayDataModule)
             and data.batches.prefetch_for is None
-            and trainer.limit_train_batches == 1.0
+            and trainer.max_epochs == -1  # its batches are counted by max_steps
         )
 
     def another(self, taken: int) -> bool:
         """Tell whether another step follows, after so many in a row."""
         trainer, val_every = self.trainer, self.trainer.val_check_batch
-        if not (self.possible and self.system.step.records) or taken >= MOST or val_every is None:
+        if not (self.possible and self.system.step.records) or val_every is None:
             return False
         epoch = trainer.fit_loop.epoch_loop
-        of_epoch = epoch.batch_progress.current.ready >= trainer.num_training_batches
-        ends = of_epoch or trainer.should_stop or trainer.global_step == trainer.max_steps
+        # Lightning would compare with the batches that it has fetched.
+        ends = epoch.batch_progress.is_last_batch = epoch.batch_progress.current.ready >= trainer.num_training_batches
         validates = (epoch.total_batch_idx + 1) % val_every == 0
-        return not (ends or validates or any(is_due(trainer, self.system) for is_due in self.asked))
+        if ends or validates or taken == MOST or trainer.should_stop:
+            return False
+        return not any(is_due(trainer, self.system) for is_due in self.asked)
 
     def batch(self) -> Batch:
         """Return the next batch; Lightning counts the last one as done, and this one as begun."""
@@ -61,7 +63,6 @@ class StepsInARow:
         epoch._batches_that_stepped += 1
         epoch.batch_progress.increment_ready()
         epoch.batch_progress.increment_started()
-        epoch.batch_progress.is_last_batch = epoch.batch_progress.current.ready >= self.trainer.num_training_batches
         batches, progress = self.trainer.datamodule.batches, self.system.step.progress  # type: ignore[attr-defined]
         return batches.at(progress.attempt, progress.rays_seen)
 

@@ -32,7 +32,8 @@ def train(nerf, capture, tmp_path):
             result = nerf(
                 "train", "scene=npz", f"scene.path={capture}", *FAST, "data.prefetch=false", "final.evaluate=false",
                 "final.video=false", "trainer.precision=32-true", "callbacks.validation_pictures.every_steps=1000",
-                f"trainer.max_steps={STEPS}", "trainer.val_every_steps=7", *changes, f"paths.output_dir={folder}",
+                f"trainer.max_steps={STEPS}", "trainer.val_every_steps=7",
+                "callbacks.checkpoints.every_steps=23", *changes, f"paths.output_dir={folder}",
             )  # fmt: skip
         assert result.code == 0, result.err
         return folder, called
@@ -47,8 +48,8 @@ def rows(folder, name):
 def test_the_run_is_that_of_single_steps_to_the_bit_and_lightning_has_counted_them(train):
     (one, every), (several, some) = train(1), train(16)
     assert every == list(range(1, STEPS + 1))
-    # Scalars and checkpoints come after every fifth step, validations after every seventh.
-    assert some == [5, 7, 10, 14, 15, 20, 21, 24]
+    # Scalars come after every fifth step, validations after every seventh, a checkpoint after the 23rd.
+    assert some == [5, 7, 10, 14, 15, 20, 21, 23, 24]
     ours, theirs = saved(several), saved(one)
     assert ours["global_step"] == STEPS
     assert ours["loops"] == theirs["loops"]
@@ -65,5 +66,5 @@ def test_a_callback_of_somebody_elses_is_called_after_each_step(train, monkeypat
 
 
 def test_a_row_is_short_where_nobody_looks(train):
-    _, called = train(4, "callbacks.monitor.every_steps=12", "callbacks.checkpoints.every_steps=100")
-    assert called == [4, 7, 10, 12, 14, 18, 20, 21, 24]
+    _, called = train(4, "callbacks.monitor.every_steps=12")
+    assert called == [4, 7, 10, 12, 14, 18, 20, 21, 23, 24]
