@@ -1,9 +1,9 @@
 """Several replayed steps for one turn of Lightning's loop, where nobody looks at those in between.
 
 Around each batch, Lightning and the callbacks keep the host busy for about a millisecond, longer than a GPU takes to
-replay a small step. A callback that acts after some steps alone says after which (`is_due`); in between, steps follow
-each other without it. Lightning's counters go on as if each had been a batch of its own, so that checkpoints and
-validations are those of a run whose steps are taken one by one.
+replay a small step. A callback that acts only after some steps says which (`is_due`); the steps in between do not wait
+for it. Lightning's counters go on as if each had been a batch of its own, so that checkpoints and validations are those
+of a run whose steps are taken one by one.
 """
 
 from typing import Any
@@ -11,13 +11,14 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 
 MOST = 16
-"""Clocks, signals and the folder are looked at after so many steps, a few hundredths of a second."""
+"""After so many steps at the latest, the clock, the progress bar and the run folder are looked at."""
 HOOKS = ("on_train_batch_start", "on_train_batch_end")
 
 
@@ -31,27 +32,28 @@ class StepsInARow:
 
     def __init__(self, trainer: Trainer, system: Any):
         self.trainer, self.system = trainer, system
-        called = [each for each in trainer.callbacks if _has_hooks(each)]  # type: ignore[attr-defined]
-        self.asked = [each.is_due for each in called if hasattr(each, "is_due")]
-        data = trainer.datamodule  # type: ignore[attr-defined]
+        callbacks, data = trainer.callbacks, trainer.datamodule  # type: ignore[attr-defined]
+        self.asked = [each.is_due for each in callbacks if hasattr(each, "is_due")]
         self.possible = (
-            len(self.asked) == len(called)  # nobody knows when somebody else's callback acts
+            all(map(_says_when, callbacks))
             and logs_for(trainer)
+            and trainer.max_epochs == -1  # the length of the run is max_steps
+            and ranks.world_size() == 1  # else all processes would have to decide alike
             and isinstance(data, RayDataModule)
             and data.batches.prefetch_for is None
-            and trainer.max_epochs == -1  # its batches are counted by max_steps
+            and data.batches.whole.ends.device == system.step.device
         )
 
     def another(self, taken: int) -> bool:
         """Tell whether another step follows, after so many in a row."""
         trainer, val_every = self.trainer, self.trainer.val_check_batch
-        if not (self.possible and self.system.step.records) or val_every is None:
+        if not self.possible or val_every is None:
             return False
         epoch = trainer.fit_loop.epoch_loop
         # Lightning would compare with the batches that it has fetched.
         ends = epoch.batch_progress.is_last_batch = epoch.batch_progress.current.ready >= trainer.num_training_batches
         validates = (epoch.total_batch_idx + 1) % val_every == 0
-        if ends or validates or taken == MOST or trainer.should_stop:
+        if ends or validates or taken == MOST or trainer.should_stop or not self.system.step.records:
             return False
         return not any(is_due(trainer, self.system) for is_due in self.asked)
 
@@ -72,5 +74,11 @@ def logs_for(trainer: Trainer) -> bool:
     return any(isinstance(each, Monitor | TrainingProgress) for each in trainer.callbacks)  # type: ignore[attr-defined]
 
 
-def _has_hooks(callback: Callback) -> bool:
-    return any(getattr(type(callback), hook) is not getattr(Callback, hook) for hook in HOOKS)
+def _says_when(callback: Callback) -> bool:
+    """Tell whether a callback acts after no step, or has said when: whoever wrote its hook wrote `is_due`, too."""
+    for place in (callback, *type(callback).__mro__):
+        if place is Callback or "is_due" in vars(place):
+            return True
+        if any(hook in vars(place) for hook in HOOKS):
+            return False
+    return True

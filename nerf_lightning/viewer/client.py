@@ -50,7 +50,7 @@ class ViewerClient:
         self.picture: UInt8[Tensor, "height width 3"] | None = None
         """What was sent last."""
         self._wants_present, self._presenting = False, threading.Lock()
-        self._looking = threading.Lock()
+        self._looking = threading.RLock()
 
     def start(self) -> None:
         """Follow the camera from now on; there is a picture at once."""
@@ -61,9 +61,9 @@ class ViewerClient:
     def look(self) -> None:
         """Wish for what the camera sees now."""
         camera = self.client.camera
-        self._notice_leaving()
         self.on_move()
-        with self._looking:  # else a thread that read the camera before it moved could wish last
+        with self._looking:  # else a thread that read the camera before it moved could have the last word
+            self._notice_leaving()
             width, height = (min(max(1, int(side)), MOST_SIDE) for side in (camera.image_width, camera.image_height))
             self.refinement.ask(CameraState(self.pose(), float(camera.fov), width, height, self.crop, self.photograph))
         self.queue.wake()

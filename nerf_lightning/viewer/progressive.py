@@ -55,7 +55,7 @@ class ProgressiveRendering:
     def give_up(self) -> None:
         """Drop what could not be rendered or shown, and wait for another wish, or for another model."""
         self.shown, self.shown_height = self._tried, self.most_height
-        self._job, self.is_stale = None, False
+        self._job = None
 
     @property
     def is_moving(self) -> bool:

@@ -4,6 +4,7 @@ from functools import partialmethod
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import Callback, LambdaCallback
 from support.running import FAST, saved
 from support.tape import tape
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -12,6 +13,7 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.training import steps_in_a_row
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
+from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
@@ -63,6 +65,31 @@ def test_a_callback_of_somebody_elses_is_called_after_each_step(train, monkeypat
     monkeypatch.delattr(FolderGuard, "is_due")
     _, called = train(16)
     assert called == list(range(1, STEPS + 1))
+
+
+class Impatient(Monitor):
+    def on_train_batch_end(self, *given):
+        """Does something after each step."""
+
+
+class Patient(Impatient):
+    def is_due(self, trainer, pl_module):
+        return False
+
+
+@pytest.mark.parametrize(
+    ("callback", "says"),
+    [
+        (Callback(), True),
+        (Monitor(), True),
+        (Impatient(), False),
+        (Patient(), True),
+        (LambdaCallback(on_train_end=print), True),
+        (LambdaCallback(on_train_batch_end=print), False),
+    ],
+)
+def test_who_wrote_what_is_called_after_steps_has_to_say_when_it_acts(callback, says):
+    assert steps_in_a_row._says_when(callback) is says
 
 
 def test_a_row_is_short_where_nobody_looks(train):

@@ -27,7 +27,7 @@ from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.tile_size import measured_tile
 
-# Without these, torch computes around the kernel of hash grids.
+# Without these, torch computes around the kernels of hash grids, random numbers and histograms.
 TWINS = (
     *("march.cpu", "ragged.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"),
     *("march.cuda", "ragged.cuda", "mlp.cuda", "adam.cuda", "render.cuda"),
@@ -60,13 +60,15 @@ class Bench:
             self.train_on(self.batch)
 
     def train_on(self, batch: Batch) -> None:
-        """Compute gradients, by a replay where training replays, and update; nothing else."""
+        """Compute gradients and update; where training replays steps, by a replay, with its guard against NaN."""
         self._update(self.optimizer, lambda: self.step.gradients_of_step(batch))
 
     def train_one_by_one(self, steps: int) -> None:
-        """Take steps on the one batch whose kernels are launched one by one."""
+        """Take steps on the one batch, whole as in a replay, whose kernels are launched one by one."""
+        self.step.tile_points = None
         for _ in range(steps):
             self._update(self.optimizer, lambda: self.step.gradients(self.batch))
+        self.step.tile_points = self.settings.tile_points
 
     def train_plainly(self, steps: int) -> None:
         """Take steps on the one batch as one would first write them."""

@@ -62,7 +62,7 @@ class TrainingProgress(ProgressBar):
         self.bar.start()
 
     def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """It can wait for others (`StepsInARow`)."""
+        """Never: it ends no row of steps (`StepsInARow`)."""
         return False
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:

@@ -60,7 +60,7 @@ def run(config: DictConfig) -> float:
     }
     result |= {
         "machine": bench.settings.describe(),
-        "tile_points": bench.settings.tile_points,
+        "tile_points": None if bench.step.records else bench.settings.tile_points,
         "batch_rays": bench.batch.num_rays,
         "training_flops_per_ray": flops,
         "peak_memory_gigabytes": peak,
@@ -158,7 +158,9 @@ def _rows_of_kernels(device: torch.device, rounds: int) -> Rows:
 
 def _print_table(result: dict[str, Any]) -> None:
     """Print a row for each quantity."""
-    table = Table(title=f"nerf bench: {result['machine']}, tiles of {result['tile_points']} points")
+    tile = result["tile_points"]
+    cut = "whole batches" if tile is None else f"tiles of {tile} points"
+    table = Table(title=f"nerf bench: {result['machine']}, {cut}")
     for column in ("", "median", "min", "max"):
         table.add_column(column, justify="left" if not column else "right")
     for name, value in result.items():
