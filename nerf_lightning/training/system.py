@@ -83,6 +83,10 @@ class RadianceFieldSystem(LightningModule):
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
         self.in_a_row = StepsInARow(self.trainer, self)
 
+    def on_fit_end(self) -> None:
+        """Forget the trainer: copies and pickles of the system are without it."""
+        del self.in_a_row
+
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
 

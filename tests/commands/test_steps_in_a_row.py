@@ -1,21 +1,15 @@
 """Replayed steps that Lightning does not see one by one leave the run that they leave one by one."""
 
-from functools import partialmethod
-
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback, LambdaCallback
 from support.running import FAST, saved
-from support.tape import tape
+from support.tape import steps_on_tape
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
-from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.training import steps_in_a_row
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.monitor import Monitor
-from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.step import TrainStep
 
 STEPS = 24
 
@@ -26,9 +20,7 @@ def train(nerf, capture, tmp_path):
 
     def run(most, *changes):
         called, folder = [], tmp_path / f"most_{most}"
-        with without(*CPU_BACKENDS), torch_on_one_thread(), pytest.MonkeyPatch.context() as patch:
-            patch.setattr(TrainerSettings, "records", lambda settings, step: True)
-            patch.setattr(TrainStep, "record_gradients", partialmethod(TrainStep.record_gradients, record=tape))
+        with steps_on_tape(), pytest.MonkeyPatch.context() as patch:
             patch.setattr(FolderGuard, "on_train_batch_end", lambda _, trainer, *__: called.append(trainer.global_step))
             patch.setattr(steps_in_a_row, "MOST", most)
             result = nerf(

@@ -4,10 +4,20 @@ As in a graph, a number that Python computed stays as it was, and what asks the 
 depends on the data, is refused.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partialmethod
+
+import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
+from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
 
 ASK_THE_HOST = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::unique", "aten::equal")
 
@@ -42,3 +52,18 @@ def tape(work):
     with Tape() as recorded:
         seen = work()
     return recorded.replay, seen
+
+
+@contextmanager
+def steps_on_tape() -> Iterator[list[int]]:
+    """Let every command record its steps, with torch in place of the kernels; return a number for each replay."""
+    replays: list[int] = []
+
+    def noted(work):
+        replay, seen = tape(work)
+        return lambda: (replays.append(len(replays)), replay()), seen
+
+    with without(*CPU_BACKENDS), torch_on_one_thread(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainerSettings, "records", lambda settings, step: True)
+        patch.setattr(TrainStep, "record_gradients", partialmethod(TrainStep.record_gradients, record=noted))
+        yield replays

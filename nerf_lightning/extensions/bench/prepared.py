@@ -75,7 +75,6 @@ class Bench:
         with self._plainly():
             for _ in range(steps):
                 self._update(self.plain_optimizer, lambda: self.step.gradients(self.batch))
-        self.step.tile_points = self.settings.tile_points
 
     def _update(self, optimizer: torch.optim.Optimizer, gradients: Callable[[], object]) -> None:
         optimizer.zero_grad()
@@ -113,6 +112,7 @@ class Bench:
         with without(*TWINS):
             yield
         self.settings.prepare(model)
+        self.step.tile_points = self.settings.tile_points
         for sampler, value in zip(samplers, former, strict=True):
             sampler.opaque_below = value
         self._release_gradients()
