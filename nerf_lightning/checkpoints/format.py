@@ -1,6 +1,7 @@
 """What a checkpoint is, key by key: what is written and what is read are held against the same annotations."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from jaxtyping import Int
@@ -11,6 +12,8 @@ from nerf_lightning.checkpoints.quantization import Quantized
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import check_cameras, check_scene
 from nerf_lightning.files.trust import Mismatch, require_fit
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
@@ -86,14 +89,19 @@ def scene_of(record: Mapping[str, Any]) -> SceneRecord:
     return SceneRecord(**record["scene"] | {"cameras": Cameras(**record["scene"]["cameras"])})
 
 
-def require_training_state(content: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint that training cannot go on from, such as one that was made smaller.
+def require_training_state(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse a checkpoint that training cannot resume from.
 
     Raises:
-        Mismatch: with the first key that it lacks.
+        InputError: it holds weights without the state of a training.
+        Mismatch: with the first key of that state that is missing.
     """
-    for place, kinds, found in (("", TRAINING, content), (KEY, OF_A_RUN, content[KEY])):
-        for key in kinds.keys() - found.keys():
-            raise Mismatch(place or "the file", f"lacks {key}, so training cannot resume from it")
+    if missing := TRAINING.keys() - content.keys():
+        raise InputError(
+            f"{path} holds weights without the state of a training ({listed(sorted(missing), 3)}), as Lightning's "
+            "save_weights_only=True and nerf prune save it. It can be rendered, evaluated and exported, but not "
+            "resumed. Resume another checkpoint of the run, or start a new run from these weights (init_from=FILE)."
+        )
+    require_fit(content[KEY], RECORD | OF_A_RUN, KEY, OPTIONAL)
     if Version(content[LIGHTNING]) < Version("2.0"):
         raise Mismatch(LIGHTNING, "is of a version that this program has never used")

@@ -10,7 +10,6 @@ quantized (weights in fewer bytes, where it was made smaller), pixels (a hash of
 import contextlib
 import logging
 import os
-import pickle
 import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, s
 from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.files.trust import Mismatch, reading, require_like, shown
+from nerf_lightning.files.trust import Mismatch, reading, require_fit, shown
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
@@ -83,7 +82,7 @@ class Checkpoint:
                 first = re.search(r"size mismatch for [\w.]+|\w+ key\(s\) in state_dict: \"[^\"]+\"", str(error))
                 where = f" ({first[0]})" if first else ""
                 raise InputError(f"{self.path} holds the {name} of another model{where}. {OTHER_MODEL}") from error
-            require_like(state, module.state_dict(), name)
+            require_fit(state, module.state_dict(), name)
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -256,13 +255,7 @@ def _load(path: Path) -> dict[str, Any]:
             "look there for last.ckpt or best.ckpt."
         )
     with reading(path, _instead_of(path)):
-        try:
-            content = load_tensors(path)
-        except pickle.UnpicklingError as error:
-            raise InputError(
-                f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and "
-                "nothing from a file is executed. Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run."
-            ) from error
+        content = load_tensors(path)
     return content if isinstance(content, dict) else {}
 
 

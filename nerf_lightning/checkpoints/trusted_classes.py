@@ -24,7 +24,7 @@ LARGEST_NUMBER = 1 << 53
 
 
 def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None:
-    """Look through a model's config from a file, before anything is built of it.
+    """Check a model's config from a file, before anything is built of it.
 
     Args:
         node: the config, or a part of it.
@@ -34,22 +34,13 @@ def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None
     Raises:
         InputError: it names what is no part of a model of ours, or holds what no config of ours does.
     """
-    if isinstance(node, list):
-        for child in node:
-            require_trusted(child, source, trusted)
-    elif isinstance(node, (int, float)) and not abs(node) <= LARGEST_NUMBER:
-        raise InputError(f"{source}: its model part holds the number {node:.3g}, which no model has. Use another one.")
-    elif isinstance(node, str):
-        if "${" in node:
-            raise InputError(f"{source}: its model part holds an interpolation ({node}), which is not read from files.")
-    elif isinstance(node, dict):
-        for key, child in node.items():
-            if key == "_target_":
-                _require_contract(child, source, trusted)
-            elif str(key).startswith("_"):
-                raise InputError(f"{source}: its model part holds the key {key}, which is not read from files.")
-            else:
-                require_trusted(child, source, trusted)
+    for key, value in _leaves(node):
+        if key == "_target_":
+            _require_contract(str(value), source, trusted)
+        elif key.startswith("_") or "${" in str(value):
+            raise InputError(f"{source}: its model part holds {key}: {value}, which is not read from files.")
+        elif isinstance(value, (int, float)) and not abs(value) <= LARGEST_NUMBER:
+            raise InputError(f"{source}: its model part holds the number {value:.3g}, which no model has.")
 
 
 def modules_to_trust(node: Any) -> list[str]:
@@ -58,30 +49,30 @@ def modules_to_trust(node: Any) -> list[str]:
     >>> modules_to_trust({"_target_": "my_parts.Model", "field": {"_target_": "nerf_lightning.nerf.fields.x.Field"}})
     ['my_parts']
     """
-    return list(dict.fromkeys(_foreign(node)))
+    targets = [str(value) for key, value in _leaves(node) if key == "_target_"]
+    return list(dict.fromkeys(target.rpartition(".")[0] for target in targets if not target.startswith(ROOMS)))
 
 
-def _foreign(node: Any) -> Iterator[str]:
-    if isinstance(node, dict) and not str(node.get("_target_", ROOMS[0])).startswith(ROOMS):
-        yield str(node["_target_"]).rpartition(".")[0]
-    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
-        yield from _foreign(child)
+def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each value with its own key; those in a list have the list's."""
+    for name, value in node.items() if isinstance(node, dict) else ((key, each) for each in node):
+        yield from _leaves(value, str(name)) if isinstance(value, (dict, list)) else ((str(name), value),)
 
 
-def _require_contract(target: Any, source: str, trusted: Sequence[str]) -> None:
-    module_name, _, class_name = str(target).rpartition(".")
+def _require_contract(target: str, source: str, trusted: Sequence[str]) -> None:
+    module_name, _, class_name = target.rpartition(".")
     is_trusted = any(f"{module_name}.".startswith(f"{each}.") for each in trusted)
-    found = None
+    part = None
     if module_name.startswith(ROOMS) or is_trusted:
         try:
-            found = getattr(importlib.import_module(module_name), class_name, None)
+            part = getattr(importlib.import_module(module_name), class_name, None)
         except ImportError as error:
             if is_trusted:
                 raise InputError(
                     f"{source} asks for {target}, which is trusted (trust={module_name}), but cannot be imported: "
                     f"{error}. Name the folder that holds it: PYTHONPATH=FOLDER nerf ..."
                 ) from error
-    if not (isinstance(found, type) and issubclass(found, CONTRACTS) and found.__module__ == module_name):
+    if not (isinstance(part, type) and issubclass(part, CONTRACTS) and part.__module__ == module_name):
         raise InputError(
             f"{source} asks for {target}, which is not a model part of this program, so it is not built. If it is your "
             f"own, add trust={module_name}; otherwise use a checkpoint from a source that you trust, or install the "

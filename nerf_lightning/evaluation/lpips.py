@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.files.trust import reading, require_fit, require_like
+from nerf_lightning.files.trust import reading, require_fit
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
@@ -95,7 +95,7 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
         state = load_tensors(path)
         require_fit(state, dict[str, object], "weights")
         state = {name: tensor for name, tensor in state.items() if name.startswith("features.")}
-        require_like(state, template, "weights")
+        require_fit(state, template, "weights")
     model.load_state_dict(state)
     return model.eval()
 
@@ -104,7 +104,7 @@ def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:
     """Return the learned weight of each channel of each compared layer."""
     source = files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
     with as_file(source) as path:
-        state = load_tensors(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)  # of torchmetrics, in PyTorch's earlier format
     return [state[f"lin{level}.model.1.weight"][0] for level in range(len(_TAPS[net]))]
 
 

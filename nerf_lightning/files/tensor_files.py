@@ -1,120 +1,167 @@
-"""Files of PyTorch's that a stranger may have made: read as data, and never larger in memory than on the disk.
+"""PyTorch's files (`torch.save`) as plain containers and tensors: one reader, so what is checked is what is loaded.
 
-`weights_only=True` runs nothing, but it still takes orders for memory: records that unpack to a thousand times their
-size, `bytearray(10**12)`, tensors of a trillion numbers that are one number repeated. The files that this program reads
-need none of that, so that all of it is refused before, or as soon as, it is seen.
+Such a file is a zip archive of a pickle (`NAME/data.pkl`) and of the bytes of each storage (`NAME/data/KEY`). A machine
+that knows only the instructions and calls of weights runs the pickle, and tensors are views of the entries' bytes: no
+code of the file is executed, and its tensors take no more memory than the file.
 """
 
 import io
 import os
 import pickle
-import pickletools
+import struct
 import zipfile
+import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
 
-CALLED = {
-    "collections OrderedDict",
-    "torch._utils _rebuild_tensor",
-    "torch._utils _rebuild_tensor_v2",
-    "torch._utils _rebuild_parameter",
+OBJECT_BYTES = 1 << 23
+"""Largest pickle and largest directory of an archive: a byte of either can become a hundred in memory."""
+LEGACY = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
+END, END64, LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
+"""What an archive ends with; PyTorch always writes the records of zip64 (the latter two) before the first one."""
+LOCAL = struct.Struct("<4s22x2H")
+INSTRUCTIONS = (
+    *(pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE),
+    *(pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.BINFLOAT, pickle.BINUNICODE),
+    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS, pickle.EMPTY_LIST, pickle.APPEND, pickle.APPENDS),
+    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
+    *(pickle.BINPUT, pickle.LONG_BINPUT, pickle.BINGET, pickle.LONG_BINGET),
+    *(pickle.GLOBAL, pickle.REDUCE, pickle.BINPERSID),
+)
+"""Of protocol 2, which torch.save writes."""
+_Machine: Any = pickle._Unpickler  # in Python, so that each instruction can be chosen
+STORAGES = {
+    **{"FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16},
+    **{"BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32},
+    **{"ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool},
 }
-"""What the files of this program, and state dicts, call."""
-ARCHIVE = b"PK\x03\x04"
-OBJECT_BYTES = 1 << 24
-"""Most bytes of that part of a file that is not numbers."""
-LEGACY_PICKLES = 5
-"""Magic number, protocol, system, objects, names of the storages; then come the numbers (torch before 1.6)."""
 
 
 def load_tensors(path: Path) -> Any:
     """Return the tensors and plain containers of a file that `torch.save` wrote, on the CPU.
 
     Raises:
-        InputError: it is no regular file, or was made to fill the memory.
-        pickle.UnpicklingError: it holds anything else than tensors and plain containers.
-        Exception: whatever torch, zipfile and pickle raise for a file that is damaged, or of another kind.
+        InputError: it is no regular file, is larger than allowed, or is in PyTorch's format from before version 1.6.
+        Mismatch: it is another kind of file, or holds anything else than tensors and plain containers.
+        Exception: whatever zipfile, pickle and torch raise for a file that is damaged.
     """
     with open_regular(path, limits().tensor_bytes) as file:
-        if zipfile.is_zipfile(file):
-            pickles: list[Any] = [_objects_of_archive(file, path)]
-        else:
-            file.seek(0)
-            pickles = [file] * LEGACY_PICKLES
-        for stream in pickles:
-            _require_plain(stream)
-        file.seek(0)
-        return _made_anew(torch.load(file, map_location="cpu", weights_only=True), path, {})
-
-
-def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
-    """Return the part of the archive that is not numbers."""
-    file.seek(0)
-    # Else PyTorch takes what stands before the archive for a file of its earlier versions.
-    if file.read(len(ARCHIVE)) != ARCHIVE:
-        raise zipfile.BadZipFile("something before the archive")
-    with zipfile.ZipFile(file) as archive:
-        entries = archive.infolist()
-        # PyTorch looks for names whatever their case, and of several takes another one than Python does.
-        if len({entry.filename.lower() for entry in entries}) < len(entries):
-            raise zipfile.BadZipFile("several entries of one name")
-        announced, size = sum(entry.file_size for entry in entries), os.fstat(file.fileno()).st_size
-        # torch.save compresses nothing. Entries that share their bytes are counted each.
-        if announced > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        if file.read(len(LEGACY)) == LEGACY:
             raise InputError(
-                f"{path} has {size:,} bytes and unpacks to {announced:,}: PyTorch saves without compression, so this "
-                "file was made to fill memory, or packed by another program. Use the file as it was saved."
+                f"{path} is in PyTorch's format from before version 1.6, which is not read. If you trust it, convert "
+                "it with today's PyTorch: torch.save(torch.load('OLD', weights_only=True), 'NEW')"
             )
-        # torch.load compares no checksums: a block of zeros in the middle of the weights would be believed.
-        damaged = archive.testzip()
-        if damaged is not None:
-            raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
-        objects = [entry for entry in entries if entry.filename.lower().endswith("data.pkl")]
-        if len(objects) != 1:
-            raise zipfile.BadZipFile("no data.pkl")
-        if objects[0].file_size > OBJECT_BYTES:
-            raise zipfile.BadZipFile(f"{objects[0].file_size:,} bytes beside its numbers")
-        return io.BytesIO(archive.read(objects[0]))
+        return _Unpickler(file).load()
 
 
-def _require_plain(stream: Any) -> None:
-    """Read the instructions of a pickle without following them."""
-    for code, argument, _ in pickletools.genops(stream):
-        if code.name == "GLOBAL" and argument not in CALLED and not _names_a_type(str(argument)):
-            raise pickle.UnpicklingError(f"calls {argument}")
+class _Entry(NamedTuple):
+    """Where the bytes of an entry lie in the file."""
+
+    start: int
+    size: int
+    checksum: int
+
+    def read(self, file: BinaryIO) -> Any:
+        """Return them as an array, in memory of their own: a mapped file can change after it was checked."""
+        content: Any = np.empty(self.size, np.uint8)
+        file.seek(self.start)
+        if file.readinto(content) != self.size or zlib.crc32(content) != self.checksum:  # type: ignore[attr-defined]
+            raise Mismatch("it", "holds an entry whose checksum is wrong")
+        return content
 
 
-def _names_a_type(argument: str) -> bool:
-    module, _, name = argument.partition(" ")
-    known = getattr(torch, name, None) if module == "torch" and name.isidentifier() else None
-    return isinstance(known, torch.dtype) or (known is not None and name.endswith("Storage"))
+def _entries(file: BinaryIO) -> dict[str, _Entry]:
+    """Return the entries of the one archive that a file is, all of them stored and none overlapping another.
 
-
-def _made_anew(node: Any, path: Path, made: dict[int, Any]) -> Any:
-    """Return tensors and containers of Python's own types; a pickle can hide an OrderedDict's methods by attributes.
-
-    `made` has what was met before, by its `id`, and what it became.
+    Raises:
+        Mismatch: with what is not so.
     """
-    if isinstance(node, Tensor):
-        if node.numel() * node.element_size() > node.untyped_storage().nbytes():
-            raise InputError(
-                f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: using it would fill "
-                "memory. This program saves no such tensors; use another file."
-            )
-        return node.detach()
-    if id(node) in made or not isinstance(node, (dict, list, tuple, set)):
-        return made.get(id(node), node)
-    if isinstance(node, dict):
-        table: dict[Any, Any] = {}
-        made[id(node)] = table  # before what it holds, which may be itself
-        table.update((key, _made_anew(value, path, made)) for key, value in dict.items(node))
-    else:
-        made[id(node)] = type(node)(_made_anew(each, path, made) for each in node)
-    return made[id(node)]
+    directory = _start_of_directory(file)
+    with zipfile.ZipFile(file) as archive:
+        listed = sorted(archive.infolist(), key=lambda entry: entry.header_offset)
+    entries, previous = dict[str, _Entry](), 0
+    for entry in listed:
+        file.seek(entry.header_offset)
+        mark, *lengths = LOCAL.unpack(file.read(LOCAL.size))
+        start = entry.header_offset + LOCAL.size + sum(lengths)
+        if mark != b"PK\x03\x04" or not previous <= entry.header_offset <= start + entry.file_size <= directory:
+            raise Mismatch("it", "holds entries that overlap")
+        if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 or entry.filename in entries:
+            raise Mismatch("it", "holds a compressed entry, or two of one name; torch.save writes neither")
+        entries[entry.filename], previous = _Entry(start, entry.file_size, entry.CRC), start + entry.file_size
+    return entries
+
+
+def _start_of_directory(file: BinaryIO) -> int:
+    size, records = os.fstat(file.fileno()).st_size, END64.size + LOCATOR.size
+    file.seek(max(0, size - records - END.size))
+    tail = file.read().rjust(records + END.size, b"\0")
+    mark, *_, length, offset, comment = END.unpack_from(tail, records)
+    end = size - END.size
+    if tail.startswith(b"PK\x06\x07", END64.size):
+        end -= records
+        mark64, *_, length64, offset64 = END64.unpack_from(tail)
+        # The fields of 32 bits may leave the numbers to those of 64.
+        same = length in (length64, 0xFFFFFFFF) and offset in (offset64, 0xFFFFFFFF)
+        if mark64 != b"PK\x06\x06" or LOCATOR.unpack_from(tail, END64.size)[2] != end or not same:
+            raise Mismatch("it", "is not one archive: its end records contradict each other")
+        length, offset = length64, offset64
+    if mark != b"PK\x05\x06" or comment or offset + length != end or length > OBJECT_BYTES:
+        raise Mismatch("it", "is not a checkpoint (one archive of torch.save), or was cut short")
+    return int(offset)
+
+
+class _Unpickler(_Machine):
+    """Follow the pickle of an archive, with fewer instructions and calls."""
+
+    # The attributes of a state dict (BUILD) are dropped: nothing here reads them.
+    dispatch: ClassVar = {code[0]: _Machine.dispatch[code[0]] for code in INSTRUCTIONS} | {
+        pickle.BUILD[0]: lambda self: self.stack.pop()
+    }
+
+    def __init__(self, file: BinaryIO):
+        self.file, self.entries, self.storages = file, _entries(file), dict[str, Tensor]()
+        pickles = [name for name in self.entries if name.endswith("/data.pkl")]
+        if len(pickles) != 1 or self.entries[pickles[0]].size > OBJECT_BYTES:
+            raise Mismatch("it", "has no data.pkl, several, or one that is too large")
+        self.root = pickles[0].removesuffix("data.pkl")
+        order = self.entries.get(f"{self.root}byteorder")
+        if order is not None and order.read(file).tobytes() != b"little":
+            raise Mismatch("it", "is not little-endian")
+        super().__init__(io.BytesIO(self.entries[pickles[0]].read(file).tobytes()))
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what stands for a global of the pickle."""
+        calls = {"OrderedDict": dict, "_rebuild_tensor_v2": _view, "_rebuild_parameter": lambda data, *_: data}
+        if module == "torch" and name in STORAGES:
+            return STORAGES[name]
+        if (module, name) != ("collections", "OrderedDict") and (module != "torch._utils" or name not in calls):
+            raise Mismatch("it", f"holds more than plain values ({module}.{name}), and nothing from a file is executed")
+        return calls[name]
+
+    def persistent_load(self, pid: Any) -> Tensor:
+        """Return a storage as a flat tensor; each is read once."""
+        _, dtype, key, _, count = pid
+        if key not in self.storages:
+            self.storages[key] = torch.from_numpy(self.entries[f"{self.root}data/{key}"].read(self.file))
+        flat = self.storages[key].view(dtype)
+        if len(flat) != count:
+            raise Mismatch("it", f"has {len(flat)} numbers in the storage {key}, not {count}")
+        return flat
+
+
+def _view(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object) -> Tensor:
+    """Return a tensor of a storage, as `torch._utils._rebuild_tensor_v2` does, without gradients or hooks."""
+    tensor = storage.as_strided(size, stride, offset)
+    if tensor.numel() > len(storage):
+        raise Mismatch("it", f"holds a tensor of the shape {tuple(size)} that repeats few numbers, to fill memory")
+    return tensor

@@ -1,11 +1,10 @@
 """The one rule for files that anybody may have made.
 
-* Nothing in a file runs. PyTorch files are read with `weights_only`, yaml and json as data; classes come from an
+* Nothing in a file runs. PyTorch files are read by `files.tensor_files`, yaml and json as data; classes come from an
   allow-list (`checkpoints.trusted_classes`), settings from an allow-list by group (`config.key_meanings`).
 * Weights and optimizer state must have the keys, shapes and dtypes of a template, which is what this config builds, and
-  be finite (`require_like`). Quantized weights are unpacked within `budgets.unpacked_bytes` first.
-* What stands beside them has the keys and kinds of its annotations (`require_fit`); a scene also passes the checks of
-  every capture (`data.captures.checks.check_scene`).
+  be finite; all else has the keys and types of its annotations (`require_fit`). A scene also passes the checks of every
+  capture (`data.captures.checks.check_scene`).
 * Integers that index or size memory are checked against their range, where they are used.
 * Anything else that a broken file raises while it is read becomes one paragraph that names the file (`reading`).
 
@@ -16,7 +15,7 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -27,13 +26,12 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 
-MOST = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
-RECORDED = (torch.float32, torch.int64, torch.uint8)  # Types of tensors with annotated shapes
+LARGEST_COUNT = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
 CURE = "It is damaged, or was made by somebody else: use another one."
 
 
 class Mismatch(ValueError):
-    """Report the first value that is not what it must be: its place, and what is wrong with it."""
+    """Report the first value that is not what it must be: where it is, and what is wrong with it."""
 
     def __init__(self, place: str, problem: str):
         super().__init__(f"{place} {problem}")
@@ -53,131 +51,96 @@ def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
         raise InputError(f"{path} cannot be read ({type(error).__name__}: {reason}). {cure}") from error
 
 
-def require_like(found: object, template: object, place: str) -> None:
-    """Refuse what differs from a template of dictionaries, lists, tensors and plain values.
-
-    Args:
-        found: as it was read; nothing is known of it.
-        template: tensors may be on `meta`. Of plain values only the type counts.
-        place: the keys from the file's top, for messages.
-
-    Raises:
-        Mismatch: other keys, lengths, types, shapes or dtypes, or numbers that are not finite.
-    """
-    if isinstance(template, Mapping):
-        table = _dict(found, place)
-        for key in [key for key in (*template, *table) if key not in table or key not in template]:
-            problem = "is missing" if key in template else "belongs to no part of this run"
-            raise Mismatch(f"{place}.{_name(key)}", problem)
-        for key, entry in template.items():
-            require_like(table[key], entry, f"{place}.{key}")
-    elif isinstance(template, (list, tuple)):
-        if type(found) is not type(template) or len(found) != len(template):
-            raise Mismatch(place, f"is {shown(found)}, not a {type(template).__name__} of {len(template)}")
-        for number, (entry, ours) in enumerate(zip(found, template, strict=True)):
-            require_like(entry, ours, f"{place}[{number}]")
-    elif isinstance(template, Tensor):
-        _require_tensor(found, place)
-        assert isinstance(found, Tensor)
-        if (found.shape, found.dtype) != (template.shape, template.dtype):
-            ours = f"{template.dtype} in {tuple(template.shape)}"
-            raise Mismatch(place, f"holds {found.dtype} in the shape {tuple(found.shape)}, and the run's {ours}")
-    else:
-        require_fit(found, type(template), place)
-
-
 def require_fit(value: object, kind: Any, place: str, optional: Mapping[str, Any] | None = None) -> None:
-    """Refuse what does not fit an annotation.
+    """Refuse what does not fit an annotation or a template.
 
     Args:
         value: as it was read; nothing is known of it.
-        kind: an annotation of plain values, containers and tensors with shapes; a dataclass, or a dictionary of
-            annotations, stands for a dictionary of its keys. `object` is anything.
+        kind: an annotation of plain values, containers and tensors with shapes (`object` is anything), or a template of
+            them: dictionaries and lists of kinds, tensors, which may be on `meta`, and plain values, of which only the
+            type counts. A dataclass stands for a dictionary of its fields.
         place: the keys from the file's top, for messages.
-        optional: keys that a dictionary of annotations may also have; of a dataclass they are those with a default.
+        optional: keys that a dictionary may also have; of a dataclass they are those with a default.
 
     Raises:
-        Mismatch: other keys or kinds, a whole number beyond 0 to 2^53, or one that is not finite.
+        Mismatch: other keys, lengths, types, shapes or dtypes, a whole number beyond 0 to 2^53, NaN or infinity.
     """
     origin, parts = get_origin(kind), get_args(kind)
-    if isinstance(kind, dict) or is_dataclass(kind):
-        _require_keys(value, kind, place, optional or {})
-    elif origin in (Union, UnionType):
-        if not (value is None and NoneType in parts):
+    if origin in (Union, UnionType):
+        if value is not None or NoneType not in parts:
             require_fit(value, next(part for part in parts if part is not NoneType), place)
     elif origin in (Literal, Annotated):
         options = range(parts[1], parts[2] + 1) if origin is Annotated else parts
-        require_fit(value, type(options[0]), place)
-        if value not in options:
+        if type(value) is not type(options[0]) or value not in options:
             either = f"from {parts[1]} to {parts[2]}" if origin is Annotated else " or ".join(map(str, parts))
             raise Mismatch(place, f"is {shown(value)}, not {either}")
-    elif origin is dict:
-        for key, entry in _dict(value, place).items():
-            require_fit(key, parts[0], f"a key of {place}")
-            require_fit(entry, parts[1], f"{place}.{_name(key)}")
-    elif origin in (list, tuple):
-        _require_kind(value, origin, place)
-        for number, entry in enumerate(value):  # type: ignore[arg-type]
-            require_fit(entry, parts[0], f"{place}[{number}]")
-    else:
-        _require_value(value, kind, place)
+    elif isinstance(kind, Tensor) or (isinstance(kind, type) and issubclass(kind, (Tensor, AbstractArray))):
+        _require_tensor(value, kind, place)
+    elif origin in (dict, list, tuple) or is_dataclass(kind) or isinstance(kind, (Mapping, list, tuple)):
+        for entry, its_kind, its_place in _entries(value, kind, place, optional or {}):
+            require_fit(entry, its_kind, its_place)
+    elif kind is not object:
+        _require_number_or_word(value, kind if isinstance(kind, type) else type(kind), place)
 
 
-def _require_keys(value: object, kind: Any, place: str, optional: Mapping[str, Any]) -> None:
-    kinds, must = kind, set(kind) if isinstance(kind, dict) else set()
-    if not isinstance(kind, dict):
-        kinds = {field.name: field.type for field in fields(kind)}
-        must = {field.name for field in fields(kind) if field.default is field.default_factory is MISSING}
-    kinds = {**kinds, **optional}
-    found = _dict(value, place)
-    for key in [key for key in found if key not in kinds]:
-        raise Mismatch(place, f"holds {shown(key)}, which no file of this program does")
-    for key in sorted(must - found.keys()):
-        raise Mismatch(place, f"lacks {key}")
-    for key, entry in found.items():
-        require_fit(entry, kinds[key], f"{place}.{key}" if place else str(key))
-
-
-def _require_value(value: object, kind: Any, place: str) -> None:
-    if kind is object:
+def _entries(value: Any, kind: Any, place: str, optional: Mapping[str, Any]) -> Iterator[tuple[Any, Any, str]]:
+    """Yield what a container holds, with its kind and its place; the container itself is checked first."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if (origin or type(kind)) in (list, tuple):
+        _require_type(value, origin or type(kind), place)
+        if origin is None and len(value) != len(kind):
+            raise Mismatch(place, f"has {len(value)} entries, not {len(kind)}")
+        kinds = kind if origin is None else [parts[0]] * len(value)
+        yield from ((entry, kinds[number], f"{place}[{number}]") for number, entry in enumerate(value))
         return
-    if kind is Tensor or (isinstance(kind, type) and issubclass(kind, AbstractArray)):
-        _require_tensor(value, place)
-        assert isinstance(value, Tensor)
-        recorded = (*RECORDED, torch.float64) if getattr(kind, "dtypes", ()) == ("float64",) else RECORDED
-        if kind is not Tensor and not (value.dtype in recorded and isinstance(value, kind)):
-            shape: Any = kind
-            ours = f"{kind.__name__.partition('[')[0].lower()} in the shape ({shape.dim_str})"
-            raise Mismatch(place, f"holds {value.dtype} in the shape {tuple(value.shape)}, not {ours}")
-    elif kind is float:
-        if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:  # type: ignore[arg-type]
-            raise Mismatch(place, f"is {shown(value)}, not a finite number")
-    elif type(value) is not kind:
-        raise Mismatch(place, f"is {shown(value)}, not of type {kind.__name__}")
-    elif kind is int and not 0 <= value <= MOST:  # type: ignore[operator]
-        raise Mismatch(place, f"is {shown(value)}, not a whole number from 0 to {MOST}")
+    _require_type(value, dict, place)
+    if origin is dict:
+        for key in value:
+            require_fit(key, parts[0], f"a key of {place}")
+        kinds = dict.fromkeys(value, parts[1])
+    elif is_dataclass(kind):
+        kinds = {field.name: field.type for field in fields(kind)}
+        optional = {name: kinds[name] for name in kinds if hasattr(kind, name)}
+    else:
+        kinds = {**kind, **optional}
+    for key in (*kinds, *value):
+        if key not in kinds or (key not in value and key not in optional):
+            raise Mismatch(_below(place, key), "is missing" if key in kinds else "belongs to no file of this kind")
+    yield from ((entry, kinds[key], _below(place, key)) for key, entry in value.items())
 
 
-def _require_tensor(value: object, place: str) -> None:
-    if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_quantized:
-        raise Mismatch(place, f"is {shown(value)}, not a tensor of numbers")
+def _require_tensor(value: Any, kind: Any, place: str) -> None:
+    _require_type(value, Tensor, place)
+    if isinstance(kind, Tensor):
+        fits, ours = (value.shape, value.dtype) == (kind.shape, kind.dtype), f"{kind.dtype} in {tuple(kind.shape)}"
+    elif kind is Tensor:
+        fits, ours = True, ""
+    else:  # of floating-point numbers float32, if no other type is annotated
+        exact = value.dtype in (torch.float32, torch.int64, torch.uint8) or kind.dtypes == ("float64",)
+        fits, ours = exact and isinstance(value, kind), f"{kind.__name__.partition('[')[0]} in ({kind.dim_str})"
+    if not fits:
+        raise Mismatch(place, f"holds {value.dtype} in the shape {tuple(value.shape)}, not {ours}")
     if value.is_floating_point() and not bool(torch.isfinite(value).all()):
         raise Mismatch(place, "holds NaN or infinity")
 
 
-def _require_kind(value: object, kind: type, place: str) -> None:
+def _require_number_or_word(value: Any, kind: type, place: str) -> None:
+    if kind is not float:
+        _require_type(value, kind, place)
+    elif type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
+        raise Mismatch(place, f"is {shown(value)}, not a finite number")
+    if kind is int and not 0 <= value <= LARGEST_COUNT:
+        raise Mismatch(place, f"is {shown(value)}, not a whole number from 0 to {LARGEST_COUNT}")
+
+
+def _require_type(value: Any, kind: type, place: str) -> None:
     if type(value) is not kind:
-        raise Mismatch(place, f"is {shown(value)}, not a {kind.__name__}")
+        raise Mismatch(place or "the file", f"is {shown(value)}, not of the type {kind.__name__}")
 
 
-def _dict(value: object, place: str) -> dict[Any, Any]:
-    if not isinstance(value, dict):
-        raise Mismatch(place, f"is {shown(value)}, not a dict")
-    return value
-
-
-def _name(key: object) -> str:
-    return ascii(str(key)[:200])[1:-1]
+def _below(place: str, key: object) -> str:
+    name = ascii(str(key)[:200])[1:-1]
+    return f"{place}.{name}" if place else name
 
 
 def shown(value: object) -> str:
@@ -188,9 +151,6 @@ def shown(value: object) -> str:
     """
     if isinstance(value, str):
         return ascii(value if len(value) <= 40 else value[:40] + "...")
-    if isinstance(value, (bool, float, type(None))):
-        return str(value)
-    if isinstance(value, int):
-        digits = int(value.bit_length() * math.log10(2)) + 1
-        return str(value) if digits <= 20 else f"a number of {digits} digits"
-    return f"a {type(value).__name__}"
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return f"a number of {int(value.bit_length() * math.log10(2)) + 1} digits"
+    return str(value) if isinstance(value, (int, float, NoneType)) else f"a {type(value).__name__}"

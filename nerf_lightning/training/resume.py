@@ -17,7 +17,7 @@ from nerf_lightning.checkpoints.format import KEY, LOOPS, require_training_state
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import use_threads
 from nerf_lightning.data.ray_batches import batch_sizes
-from nerf_lightning.files.trust import Mismatch, reading, require_fit, require_like
+from nerf_lightning.files.trust import Mismatch, reading, require_fit
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 
@@ -97,8 +97,8 @@ def require_resumable(
         InputError: with the place in the checkpoint.
     """
     with reading(path, CURE):
-        require_training_state(content)
-        require_like(content["state_dict"], weights, "state_dict")
+        require_training_state(content, path)
+        require_fit(content["state_dict"], weights, "state_dict")
         for name, switch in weights.items():  # which kind of space this is, and with it the shapes of others
             if switch.dtype == torch.bool and not switch.dim() and bool(switch) != bool(content["state_dict"][name]):
                 raise Mismatch(f"state_dict.{name}", f"is not {bool(switch)}, as the run's scene and settings are")
@@ -110,7 +110,7 @@ def require_resumable(
                 require_fit(content["callbacks"][key], getattr(callback, "STATE", object), f"callbacks.{key}")
             elif getattr(callback, "needs_state", False):
                 raise Mismatch(f"callbacks.{key}", "is missing")
-        require_like(content["loops"], loops, "loops")
+        require_fit(content["loops"], loops, "loops")
         steps = content["loops"]["fit_loop"]["epoch_loop.manual_optimization.optim_step_progress"]["total"]
         if set(steps.values()) != {content["global_step"]}:
             raise Mismatch("loops.fit_loop", f"has not taken the {content['global_step']} steps of the checkpoint")
@@ -130,7 +130,7 @@ def _require_optimizer(state: Any, optimizer: Optimizer, build: Build) -> None:
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     if state["state"]:  # one that has taken no step keeps nothing
         template = dict(enumerate(_kept_of(parameter, build) for parameter in parameters))
-        require_like(state["state"], template, "optimizer_states")
+        require_fit(state["state"], template, "optimizer_states")
 
 
 def _settings(group: Mapping[str, Any]) -> dict[str, Any]:

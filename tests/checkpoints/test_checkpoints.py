@@ -76,7 +76,7 @@ def test_the_newest_is_read_and_two_damaged_ones_are_refused(tmp_path, caplog):
     assert newest_checkpoint(tmp_path / "nothing") is None
     DAMAGE["cut off"](keep_two(tmp_path))
     DAMAGE["no bytes"](tmp_path / "previous.ckpt")
-    with pytest.raises(InputError, match=r"last\.ckpt cannot be read"):
+    with pytest.raises(InputError, match=r"last\.ckpt is damaged"):
         newest_checkpoint(tmp_path)
 
 

@@ -1,6 +1,7 @@
 """PyTorch's files as plain containers and tensors, whatever their pickles make of themselves."""
 
 import pickle
+import struct
 import zipfile
 from collections import OrderedDict
 
@@ -22,14 +23,14 @@ class Shadowed(dict):
         return OrderedDict, (), hidden, None, iter(dict.items(self))
 
 
-def altered(path, change):
+def altered(path, change, compression=zipfile.ZIP_STORED):
     """Write an archive anew with what `change` makes of its names and contents."""
     with zipfile.ZipFile(path) as archive:
         entries = [(name, archive.read(name)) for name in archive.namelist()]
     with zipfile.ZipFile(path, "w") as archive, pytest.MonkeyPatch.context() as patched:
         patched.setattr("warnings.warn", lambda *words, **options: None)  # of a name that is there twice
         for name, data in change(entries):
-            archive.writestr(name, data)
+            archive.writestr(zipfile.ZipInfo(name), data, compression)
 
 
 def test_containers_and_tensors_are_made_anew(tmp_path):
@@ -74,21 +75,94 @@ def test_a_checkpoint_of_shadowed_dictionaries_is_checked_like_any(tmp_path, pla
     refused(read_checkpoint, path, parts=("a.ckpt", "repeats few numbers"))
 
 
-@pytest.mark.parametrize("name", ["DATA.PKL", "data.pkl", "data/0", "Data/0"])
+def with_prefix(path):
+    """PyTorch would read what stands before the archive."""
+    return pickle.dumps("read in its place", protocol=2) + path.read_bytes()
+
+
+def with_two_archives(path):
+    """Offsets that are relative to the second archive for one reader, and for another those of the first."""
+    altered(path, lambda entries: entries)
+    sound = path.read_bytes()
+    altered(path, lambda entries: [(name, bytes(len(data)) if len(data) == 1024 else data) for name, data in entries])
+    return path.read_bytes()[:-22] + sound
+
+
+def with_an_end_behind_the_end(path):
+    """Python sees no archive, so that the instructions of a pickle are looked for, and are those of a name."""
+    altered(
+        path,
+        lambda entries: [(f"\n...../{name[2:]}", data) for name, data in [("a/first", b""), *entries]],
+        zipfile.ZIP_DEFLATED,
+    )
+    return path.read_bytes() + b"PK\x05\x06"
+
+
+def with_another_directory(path):
+    """A locator of zip64 that points to other records than those before it."""
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<Q", content, len(content) - 42 + 8, 0)
+    return bytes(content)
+
+
+def with_bytes_used_twice(path):
+    """An entry of the directory that has the bytes of another one."""
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        start, entries = archive.start_dir, archive.infolist()
+    second = content.index(entries[1].filename.encode(), start) - 46
+    struct.pack_into("<L", content, second + 42, entries[0].header_offset)
+    return bytes(content)
+
+
+OTHERS = {
+    "a prefix": with_prefix,
+    "two archives": with_two_archives,
+    "an end behind the end": with_an_end_behind_the_end,
+    "a comment": lambda path: path.read_bytes()[:-2] + b"\x01\x00!",
+    "another directory": with_another_directory,
+    "bytes used twice": with_bytes_used_twice,
+    "numbers that differ": lambda path: path.read_bytes()[:-6] + bytes(6),
+}
+
+
+@pytest.mark.parametrize("change", OTHERS.values(), ids=OTHERS)
+def test_only_exactly_one_archive_is_read(tmp_path, change):
+    """Two readers of archives may find different contents in these, so there is no right one."""
+    path = write_checkpoint(tmp_path / "a.ckpt")
+    path.write_bytes(change(path))
+    refused(read_checkpoint, path, parts=("a.ckpt is damaged, or was made by somebody else: it ",))
+
+
+@pytest.mark.parametrize("name", ["data.pkl", "data/0"])
 def test_names_that_stand_in_an_archive_twice_are_refused(tmp_path, name):
-    """PyTorch looks for names whatever their case, and takes another one of several than Python does."""
     path = write_checkpoint(tmp_path / "a.ckpt")
     altered(path, lambda entries: [*entries, (f"a/{name}", b"")])
-    refused(read_checkpoint, path, parts=("a.ckpt cannot be read",))
+    refused(read_checkpoint, path, parts=("a.ckpt", "two of one name"))
 
 
-def test_what_stands_before_an_archive_is_refused(tmp_path):
-    """PyTorch would read it in the place of the archive."""
+def test_storages_are_what_the_file_holds(tmp_path):
+    """A storage that claims more numbers than its entry has would be filled from nowhere."""
+    path = write_checkpoint(tmp_path / "a.ckpt", lambda content: content.update(extra=torch.zeros(1000)))
+    with zipfile.ZipFile(path) as archive:
+        content = archive.read("a/data.pkl")
+    replace_pickle(path, content.replace(b"M\xe8\x03t", b"J\x00\x00\x00\x7ft"))
+    refused(read_checkpoint, path, parts=("a.ckpt", "1000 numbers in the storage"))
+
+
+@pytest.mark.parametrize(
+    "instruction", [b"\x96" + bytes([255] * 5) + bytes(3), b"c__builtin__\nbytearray\n.", b"\x93."]
+)
+def test_instructions_that_weights_do_not_need_are_refused(tmp_path, instruction):
     path = write_checkpoint(tmp_path / "a.ckpt")
-    path.write_bytes(pickle.dumps("read in its place", protocol=2) + path.read_bytes())
-    with pytest.raises(zipfile.BadZipFile, match="something before the archive"):
-        load_tensors(path)
-    refused(read_checkpoint, path, parts=("a.ckpt cannot be read",))
+    replace_pickle(path, b"\x80\x02" + instruction)
+    refused(read_checkpoint, path, parts=("a.ckpt",))
+
+
+def test_the_format_before_1_6_says_how_to_convert(tmp_path):
+    """A file of it can order any memory: a storage that its list of keys omits is never held against the file."""
+    torch.save({"a": torch.ones(2)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
+    refused(load_tensors, tmp_path / "a.pt", parts=("before version 1.6", "torch.save(torch.load('OLD'"))
 
 
 def test_lists_in_lists_without_end_are_refused(tmp_path):
