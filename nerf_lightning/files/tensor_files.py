@@ -12,7 +12,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -30,20 +30,12 @@ END, END64, LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), st
 """What an archive ends with; PyTorch always writes the records of zip64 (the latter two) before the first one."""
 LOCAL = struct.Struct("<4s22x2H")
 INSTRUCTIONS = (
-    *(pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE),
-    *(pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.BINFLOAT, pickle.BINUNICODE),
-    *(pickle.EMPTY_DICT, pickle.SETITEM, pickle.SETITEMS, pickle.EMPTY_LIST, pickle.APPEND, pickle.APPENDS),
-    *(pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3),
-    *(pickle.BINPUT, pickle.LONG_BINPUT, pickle.BINGET, pickle.LONG_BINGET),
-    *(pickle.GLOBAL, pickle.REDUCE, pickle.BINPERSID),
+    "PROTO STOP MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE EMPTY_LIST APPEND APPENDS "
+    "EMPTY_DICT SETITEM SETITEMS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL "
+    "REDUCE BINPERSID"
 )
-"""Of protocol 2, which torch.save writes."""
-_Machine: Any = pickle._Unpickler  # in Python, so that each instruction can be chosen
-STORAGES = {
-    **{"FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16},
-    **{"BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32},
-    **{"ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool},
-}
+"""Of protocol 2, which torch.save writes; BUILD, which sets attributes of state dicts, is passed over."""
+_Machine: Any = pickle._Unpickler  # in Python, so that instructions can be left out
 
 
 def load_tensors(path: Path) -> Any:
@@ -63,24 +55,10 @@ def load_tensors(path: Path) -> Any:
         return _Unpickler(file).load()
 
 
-class _Entry(NamedTuple):
-    """Where the bytes of an entry lie in the file."""
+def _entries(file: io.BufferedReader) -> dict[str, tuple[int, int, int]]:
+    """Return by name where the bytes of each entry begin, their number and their checksum.
 
-    start: int
-    size: int
-    checksum: int
-
-    def read(self, file: BinaryIO) -> Any:
-        """Return them as an array, in memory of their own: a mapped file can change after it was checked."""
-        content: Any = np.empty(self.size, np.uint8)
-        file.seek(self.start)
-        if file.readinto(content) != self.size or zlib.crc32(content) != self.checksum:  # type: ignore[attr-defined]
-            raise Mismatch("it", "holds an entry whose checksum is wrong")
-        return content
-
-
-def _entries(file: BinaryIO) -> dict[str, _Entry]:
-    """Return the entries of the one archive that a file is, all of them stored and none overlapping another.
+    The file is exactly one archive, whose entries are stored and do not overlap.
 
     Raises:
         Mismatch: with what is not so.
@@ -88,7 +66,7 @@ def _entries(file: BinaryIO) -> dict[str, _Entry]:
     directory = _start_of_directory(file)
     with zipfile.ZipFile(file) as archive:
         listed = sorted(archive.infolist(), key=lambda entry: entry.header_offset)
-    entries, previous = dict[str, _Entry](), 0
+    entries, previous = dict[str, tuple[int, int, int]](), 0
     for entry in listed:
         file.seek(entry.header_offset)
         mark, *lengths = LOCAL.unpack(file.read(LOCAL.size))
@@ -97,11 +75,11 @@ def _entries(file: BinaryIO) -> dict[str, _Entry]:
             raise Mismatch("it", "holds entries that overlap")
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 or entry.filename in entries:
             raise Mismatch("it", "holds a compressed entry, or two of one name; torch.save writes neither")
-        entries[entry.filename], previous = _Entry(start, entry.file_size, entry.CRC), start + entry.file_size
+        entries[entry.filename], previous = (start, entry.file_size, entry.CRC), start + entry.file_size
     return entries
 
 
-def _start_of_directory(file: BinaryIO) -> int:
+def _start_of_directory(file: io.BufferedReader) -> int:
     size, records = os.fstat(file.fileno()).st_size, END64.size + LOCATOR.size
     file.seek(max(0, size - records - END.size))
     tail = file.read().rjust(records + END.size, b"\0")
@@ -120,48 +98,66 @@ def _start_of_directory(file: BinaryIO) -> int:
     return int(offset)
 
 
-class _Unpickler(_Machine):
-    """Follow the pickle of an archive, with fewer instructions and calls."""
-
-    # The attributes of a state dict (BUILD) are dropped: nothing here reads them.
-    dispatch: ClassVar = {code[0]: _Machine.dispatch[code[0]] for code in INSTRUCTIONS} | {
-        pickle.BUILD[0]: lambda self: self.stack.pop()
-    }
-
-    def __init__(self, file: BinaryIO):
-        self.file, self.entries, self.storages = file, _entries(file), dict[str, Tensor]()
-        pickles = [name for name in self.entries if name.endswith("/data.pkl")]
-        if len(pickles) != 1 or self.entries[pickles[0]].size > OBJECT_BYTES:
-            raise Mismatch("it", "has no data.pkl, several, or one that is too large")
-        self.root = pickles[0].removesuffix("data.pkl")
-        order = self.entries.get(f"{self.root}byteorder")
-        if order is not None and order.read(file).tobytes() != b"little":
-            raise Mismatch("it", "is not little-endian")
-        super().__init__(io.BytesIO(self.entries[pickles[0]].read(file).tobytes()))
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return what stands for a global of the pickle."""
-        calls = {"OrderedDict": dict, "_rebuild_tensor_v2": _view, "_rebuild_parameter": lambda data, *_: data}
-        if module == "torch" and name in STORAGES:
-            return STORAGES[name]
-        if (module, name) != ("collections", "OrderedDict") and (module != "torch._utils" or name not in calls):
-            raise Mismatch("it", f"holds more than plain values ({module}.{name}), and nothing from a file is executed")
-        return calls[name]
-
-    def persistent_load(self, pid: Any) -> Tensor:
-        """Return a storage as a flat tensor; each is read once."""
-        _, dtype, key, _, count = pid
-        if key not in self.storages:
-            self.storages[key] = torch.from_numpy(self.entries[f"{self.root}data/{key}"].read(self.file))
-        flat = self.storages[key].view(dtype)
-        if len(flat) != count:
-            raise Mismatch("it", f"has {len(flat)} numbers in the storage {key}, not {count}")
-        return flat
-
-
 def _view(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object) -> Tensor:
     """Return a tensor of a storage, as `torch._utils._rebuild_tensor_v2` does, without gradients or hooks."""
     tensor = storage.as_strided(size, stride, offset)
     if tensor.numel() > len(storage):
         raise Mismatch("it", f"holds a tensor of the shape {tuple(size)} that repeats few numbers, to fill memory")
     return tensor
+
+
+GLOBALS: dict[str, Any] = {
+    "collections.OrderedDict": dict,
+    "torch._utils._rebuild_tensor_v2": _view,
+    "torch._utils._rebuild_parameter": lambda data, *_: data,
+    **{"torch.FloatStorage": torch.float32, "torch.DoubleStorage": torch.float64, "torch.HalfStorage": torch.float16},
+    **{"torch.BFloat16Storage": torch.bfloat16, "torch.LongStorage": torch.int64, "torch.IntStorage": torch.int32},
+    **{"torch.ShortStorage": torch.int16, "torch.CharStorage": torch.int8, "torch.ByteStorage": torch.uint8},
+    "torch.BoolStorage": torch.bool,
+}
+"""What the files of this program, and state dicts, call; a storage is read as numbers of its dtype."""
+
+
+class _Unpickler(_Machine):
+    """Follow the pickle of an archive, with fewer instructions and calls."""
+
+    dispatch: ClassVar = {
+        code[0]: _Machine.dispatch[code[0]] for code in (vars(pickle)[name] for name in INSTRUCTIONS.split())
+    }
+    dispatch[pickle.BUILD[0]] = lambda self: self.stack.pop()
+
+    def __init__(self, file: io.BufferedReader):
+        self.file, self.entries, self.storages = file, _entries(file), dict[str, Tensor]()
+        names = [name for name in self.entries if name.endswith("/data.pkl")]
+        if len(names) != 1 or self.entries[names[0]][1] > OBJECT_BYTES:
+            raise Mismatch("it", "has no data.pkl, several, or one that is too large")
+        self.root = names[0].removesuffix("data.pkl")
+        if f"{self.root}byteorder" in self.entries and self._content("byteorder").tobytes() != b"little":
+            raise Mismatch("it", "is not little-endian")
+        super().__init__(io.BytesIO(self._content("data.pkl").tobytes()))
+
+    def _content(self, name: str) -> Any:
+        """Return the bytes of an entry, in memory of their own: a mapped file can change after it was checked."""
+        start, size, checksum = self.entries[f"{self.root}{name}"]
+        content: Any = np.empty(size, np.uint8)
+        self.file.seek(start)
+        if self.file.readinto(content) != size or zlib.crc32(content) != checksum:
+            raise Mismatch("it", f"has the wrong checksum in {name}")
+        return content
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what a global of the pickle stands for."""
+        path = f"{module}.{name}"
+        if path not in GLOBALS:
+            raise Mismatch("it", f"holds more than plain values ({path[:100]!a}), and nothing from a file is executed")
+        return GLOBALS[path]
+
+    def persistent_load(self, pid: Any) -> Tensor:
+        """Return a storage as a flat tensor; each is read once."""
+        _, dtype, key, _, count = pid
+        if key not in self.storages:
+            self.storages[key] = torch.from_numpy(self._content(f"data/{key}"))
+        flat = self.storages[key].view(dtype)
+        if len(flat) != count:
+            raise Mismatch("it", f"has {len(flat)} numbers in the storage {key}, not {count}")
+        return flat
