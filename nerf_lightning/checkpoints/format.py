@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from jaxtyping import Int
+from jaxtyping import Int, jaxtyped
 from packaging.version import Version
 from torch import Tensor
 
@@ -55,9 +55,6 @@ TRAINING: dict[str, Any] = {
 """What training goes on from, beside the record; the run that does holds it against its own (`training/resume.py`)."""
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
-SIDES: dict[str, tuple[int, ...]] = {"c2w": (3, 4), "focal": (2,), "center": (2,), "lens": (6,), "ndc": (2,)}
-SIDES |= dict.fromkeys(("width", "height", "near", "far", "pixels"), ())
-"""Of what there is for each view, behind the views."""
 
 
 def require_checkpoint(content: dict[str, Any], where: str) -> None:
@@ -72,16 +69,14 @@ def require_checkpoint(content: dict[str, Any], where: str) -> None:
         if not name.startswith(PARTS):
             raise Mismatch(f"state_dict.{name}", "belongs to no part of a run")
     record = content[KEY]
-    require_fit(record, RECORD, KEY, OF_A_RUN | OPTIONAL)
+    with jaxtyped("context"):  # `views` is one number in all shapes
+        require_fit(record, RECORD, KEY, OF_A_RUN | OPTIONAL)
     scene = record["scene"]
-    views, refined = len(scene["view_names"]), record.get("refined", {})
-    for place, tensors in (("scene", scene), ("scene.cameras", scene["cameras"]), ("refined", refined), (KEY, record)):
-        for name in tensors.keys() & SIDES.keys():
-            if tensors[name] is not None and tensors[name].shape != (views, *SIDES[name]):
-                raise Mismatch(f"{place}.{name}", f"has the shape {tuple(tensors[name].shape)}, of {views} views")
+    if not scene["near"].shape == scene["cameras"]["width"].shape == (len(scene["view_names"]),):
+        raise Mismatch("scene.view_names", f"names {len(scene['view_names'])} views, and there are others")
     check_scene(scene_of(record), where)
-    if refined:
-        check_cameras(Cameras(**refined), "refined", where)
+    if "refined" in record:
+        check_cameras(Cameras(**record["refined"]), "refined", where)
 
 
 def scene_of(record: Mapping[str, Any]) -> SceneRecord:

@@ -33,6 +33,8 @@ def checked(given: Any = None, *, typechecker: Any = None) -> Any:
     """Decorate a function, or the `__init__` of a dataclass, so that its calls are checked; a class stays as it is."""
     if given is None:
         return functools.partial(checked, typechecker=typechecker)
+    if given == "context":  # of a `with`
+        return slowly_checked(given)
     if not inspect.isclass(given):
         return _function(given, typechecker)
     if dataclasses.is_dataclass(given) and "__init__" in vars(given):
