@@ -72,8 +72,9 @@ def require_checkpoint(content: dict[str, Any], where: str) -> None:
     with jaxtyped("context"):  # `views` is one number in all shapes
         require_fit(record, RECORD, KEY, OF_A_RUN | OPTIONAL)
     scene = record["scene"]
-    if not scene["near"].shape == scene["cameras"]["width"].shape == (len(scene["view_names"]),):
-        raise Mismatch("scene.view_names", f"names {len(scene['view_names'])} views, and there are others")
+    names, cameras = scene["view_names"], scene["cameras"]["width"]
+    if not scene["near"].shape == cameras.shape == (len(names),):
+        raise Mismatch("scene.view_names", f"names {len(names)} views, and there are {cameras.numel()} cameras")
     check_scene(scene_of(record), where)
     if "refined" in record:
         check_cameras(Cameras(**record["refined"]), "refined", where)

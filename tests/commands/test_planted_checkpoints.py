@@ -170,7 +170,7 @@ def state(**changed):
 
 
 RECORDS = {
-    "fewer": (camera(focal=torch.ones(3, 2)), "focal has the shape (3, 2), of 6 views"),
+    "fewer": (camera(focal=torch.ones(3, 2)), "focal holds torch.float32 in the shape (3, 2), not Float in (*views 2)"),
     "NaN": (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
     "no poses": (camera(c2w=torch.zeros(6, 3, 4)), "a pose that is not a rotation"),
     "far away": (camera(center=torch.full((6, 2), 3e38)), "center has numbers beyond 1e+09"),
@@ -180,7 +180,7 @@ RECORDS = {
     "no extent": (recorded(far=torch.zeros(6)), "near is not everywhere from 0"),
     "no box": (recorded(aabb=torch.zeros(2, 3)), "aabb has no inside"),
     "no frame": (recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0])).double()), "to_user is not a rot"),
-    "no views": (recorded(view_names=()), "of 0 views"),
+    "no views": (recorded(view_names=()), "names 0 views, and there are 6 cameras"),
     "views alike": (recorded(view_names=("a",) * 6), "view_names names two views alike"),
     "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "more than 1024 characters"),
     "a terminal's name": (recorded(view_names=("a\x1b[2J", *"bcdef")), "which holds control characters"),
