@@ -83,7 +83,7 @@ def _start_of_directory(file: io.BufferedReader) -> int:
     size, records = os.fstat(file.fileno()).st_size, END64.size + LOCATOR.size
     file.seek(max(0, size - records - END.size))
     tail = file.read().rjust(records + END.size, b"\0")
-    mark, *_, length, offset, comment = END.unpack_from(tail, records)
+    mark, *_, length, offset, _ = END.unpack_from(tail, records)
     end = size - END.size
     if tail.startswith(b"PK\x06\x07", END64.size):
         end -= records
@@ -93,7 +93,7 @@ def _start_of_directory(file: io.BufferedReader) -> int:
         if mark64 != b"PK\x06\x06" or LOCATOR.unpack_from(tail, END64.size)[2] != end or not same:
             raise Mismatch("it", "is not one archive: its end records contradict each other")
         length, offset = length64, offset64
-    if mark != b"PK\x05\x06" or comment or offset + length != end or length > OBJECT_BYTES:
+    if mark != b"PK\x05\x06" or offset + length != end or length > OBJECT_BYTES:
         raise Mismatch("it", "is not a checkpoint (one archive of torch.save), or was cut short")
     return int(offset)
 

@@ -120,6 +120,7 @@ OTHERS = {
     "two archives": with_two_archives,
     "an end behind the end": with_an_end_behind_the_end,
     "a comment": lambda path: path.read_bytes()[:-2] + b"\x01\x00!",
+    "a gap": lambda path: path.read_bytes()[:-98] + bytes(8) + path.read_bytes()[-98:],
     "another directory": with_another_directory,
     "bytes used twice": with_bytes_used_twice,
     "numbers that differ": lambda path: path.read_bytes()[:-6] + bytes(6),
