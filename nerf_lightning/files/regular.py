@@ -1,32 +1,39 @@
 """Files of folders that anybody may have made: opened only where they are regular files, and of a bounded size.
 
 An archive can carry a FIFO, which is waited for without end, and a link can lead to a device. So a file is opened
-without waiting, and asked what it is once it is open: nobody can put another one in its place in between.
+without waiting, and checked once it is open: nobody can put another one in its place in between. Who needs a file opens
+it, and does not ask first whether it is there: what is in its place is explained here.
 """
 
 import codecs
-import errno
 import io
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 # Of posix; Windows has neither FIFOs nor devices among its files.
 WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 BINARY = getattr(os, "O_BINARY", 0)
-KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a named pipe (FIFO)"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe (FIFO)",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
+}
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
+OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+class AbsentError(InputError):
+    """Report that there is no file at a path."""
 
 
 def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
@@ -39,6 +46,7 @@ def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_li
         follow_links: open what a symbolic link leads to; where it may lead is for the caller to say.
 
     Raises:
+        AbsentError: there is none.
         InputError: it is no regular file, is larger, or is a link that is not followed.
         OSError: it cannot be opened.
     """
@@ -53,6 +61,29 @@ def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
         OSError: it cannot be opened.
     """
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
+
+
+def open_own(path: Path, most_bytes: int | None) -> io.BufferedReader:
+    """Open a regular file as `open_regular` does that only the user can have written, if the folder is the user's own.
+
+    Raises:
+        InputError: it belongs to somebody else or can be written by others, too.
+    """
+    file = open_regular(path, most_bytes, "Remove it, and it will be made again.", follow_links=False)
+    if reason := not_private(os.fstat(file.fileno())):
+        file.close()
+        raise InputError(f"{path} {reason}, so it may come from somebody else. Remove it, and it will be made again.")
+    return file
+
+
+def not_private(state: os.stat_result) -> str | None:
+    """Return in words what keeps a file or folder from being the user's alone, None where it is; on Windows always."""
+    if os.name != "posix":
+        return None
+    if state.st_uid != os.geteuid():
+        return f"belongs to another user (number {state.st_uid})"
+    mode = stat.S_IMODE(state.st_mode)
+    return f"can be written by others (mode {mode:04o})" if mode & OTHERS_MAY_WRITE else None
 
 
 def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
@@ -88,45 +119,60 @@ def explained(path: Path, cure: str = CURE) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}. {cure}") from error
-    except ValueError as error:  # NUL
-        raise InputError(f"{path} cannot be read: {error}. {cure}") from error
+
+
+def what_is(path: Path) -> str:
+    """Return what lies at a path, as the rest of a sentence that begins with it.
+
+    >>> what_is(Path("/")), what_is(Path("/nowhere"))
+    ('is a folder', 'does not exist')
+    """
+    try:
+        return f"is {KINDS.get(stat.S_IFMT(os.stat(path).st_mode), 'a file')}"
+    except PermissionError:
+        return "cannot be accessed (permission denied)"
+    except (OSError, ValueError):  # NUL, too long, or a loop of links
+        is_link = os.path.islink(path)
+        return f"is a symbolic link to {os.readlink(path)}, which leads nowhere" if is_link else "does not exist"
+
+
+def contents(folder: Path) -> str:
+    """Return what a folder holds, in a few words: names, with what they are where that is neither file nor folder."""
+    try:
+        paths = [folder / name for name in sorted(os.listdir(folder))]
+    except (OSError, ValueError) as error:  # it is not there either
+        return f"nothing that can be read ({getattr(error, 'strerror', error)})"
+    kinds = [what_is(path).removeprefix("is ") for path in paths]
+    noted = ["" if kind in ("a file", "a folder") else f" ({kind})" for kind in kinds]
+    return listed(path.name + note for path, note in zip(paths, noted, strict=True)) or "nothing"
 
 
 def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_links: bool) -> int:
-    link = 0 if follow_links else NO_LINK
     try:
-        handle = os.open(path, flags | WITHOUT_WAITING | BINARY | link, 0o666)
-    except OSError as error:
-        # A socket, or a pipe that nobody reads, cannot be opened; a link has an error of its own.
-        kind = "a symbolic link" if link and error.errno in (errno.ELOOP, errno.EMLINK) else _kind_by_name(path)
-        if kind is None:
+        handle = os.open(path, flags | WITHOUT_WAITING | BINARY | (0 if follow_links else NO_LINK), 0o666)
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
+            _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
+        if isinstance(error, PermissionError) or os.path.exists(path):
             raise
-        raise InputError(_of_another_kind(path, kind, cure)) from error
+        raise AbsentError(
+            f"{path} {what_is(path)}; the folder holds {contents(path.parent)}. Put the file there, or give another "
+            "path."
+        ) from error
     try:
-        state = os.fstat(handle)
-        if not stat.S_ISREG(state.st_mode):
-            raise InputError(_of_another_kind(path, _kind(state.st_mode) or "no regular file", cure))
-        if most_bytes is not None and state.st_size > most_bytes:
-            raise InputError(_too_large(path, state.st_size, most_bytes, cure))
+        _require_regular(path, os.fstat(handle), most_bytes, cure)
     except BaseException:
         os.close(handle)
         raise
     return handle
 
 
-def _kind_by_name(path: Path) -> str | None:
-    try:
-        return _kind(os.stat(path).st_mode)
-    except OSError:
-        return None
-
-
-def _kind(mode: int) -> str | None:
-    return next((name for is_kind, name in KINDS if is_kind(mode)), None)
-
-
-def _of_another_kind(path: Path, kind: str, cure: str) -> str:
-    return f"{path} is {kind}, and only regular files are opened here. {cure}"
+def _require_regular(path: Path, state: os.stat_result, most_bytes: int | None, cure: str) -> None:
+    if not stat.S_ISREG(state.st_mode):
+        kind = KINDS.get(stat.S_IFMT(state.st_mode), "no regular file")
+        raise InputError(f"{path} is {kind}, and only regular files are opened here. {cure}")
+    if most_bytes is not None and state.st_size > most_bytes:
+        raise InputError(_too_large(path, state.st_size, most_bytes, cure))
 
 
 def _too_large(path: Path, size: int, most_bytes: int, cure: str) -> str:

@@ -6,13 +6,13 @@ import sys
 import pytest
 import yaml
 from filelock import FileLock
+from nerf_lightning.files.links import require_no_way_out
 from omegaconf import OmegaConf
 from support.configs import composed
 from support.running import FAST, said
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.files.folders import conf_folder
-from nerf_lightning.files.links import require_no_way_out
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep, to_give_again

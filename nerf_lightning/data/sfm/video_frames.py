@@ -66,8 +66,6 @@ def count_frames(path: Path) -> int:
     """Return how many frames a video has; refuse what is no video."""
     import imageio_ffmpeg
 
-    if not path.is_file():
-        raise InputError(f"video={path}: there is no such file. Give a video, or a folder of photographs with images=.")
     require_video(path)
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
