@@ -29,6 +29,7 @@ KINDS = {
     stat.S_IFLNK: "a symbolic link",
 }
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
+MOST_NAMES = 10  # Of a folder, in a message
 OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -139,12 +140,12 @@ def what_is(path: Path) -> str:
 def contents(folder: Path) -> str:
     """Return what a folder holds, in a few words: names, with what they are where that is neither file nor folder."""
     try:
-        paths = [folder / name for name in sorted(os.listdir(folder))]
-    except (OSError, ValueError) as error:  # it is not there either
+        names = sorted(os.listdir(folder))
+    except (OSError, ValueError) as error:  # it does not exist either
         return f"nothing that can be read ({getattr(error, 'strerror', error)})"
-    kinds = [what_is(path).removeprefix("is ") for path in paths]
-    noted = ["" if kind in ("a file", "a folder") else f" ({kind})" for kind in kinds]
-    return listed(path.name + note for path, note in zip(paths, noted, strict=True)) or "nothing"
+    kinds = [what_is(folder / name).removeprefix("is ") for name in names[:MOST_NAMES]]
+    notes = ["" if kind in ("a file", "a folder") else f" ({kind})" for kind in kinds]
+    return listed([*map(str.__add__, names, notes), *names[MOST_NAMES:]], MOST_NAMES) or "nothing"
 
 
 def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_links: bool) -> int:
@@ -155,10 +156,9 @@ def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_li
             _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
         if isinstance(error, PermissionError) or os.path.exists(path):
             raise
-        raise AbsentError(
-            f"{path} {what_is(path)}; the folder holds {contents(path.parent)}. Put the file there, or give another "
-            "path."
-        ) from error
+        reason = what_is(path)
+        held = "" if os.path.islink(path) else f"; the folder holds {contents(path.parent)}"
+        raise AbsentError(f"{path} {reason}{held}. Put the file there, or give another path.") from error
     try:
         _require_regular(path, os.fstat(handle), most_bytes, cure)
     except BaseException:

@@ -34,7 +34,7 @@ from nerf_lightning.files.made_folders import child_of, make_folder, require_no_
 from nerf_lightning.files.regular import open_to_append, what_is
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import EscapingFormatter
+from nerf_lightning.messages.escaping import EscapingFormatter, is_plain
 from nerf_lightning.runs.identity import run_identity, settings_digest
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 
@@ -131,6 +131,12 @@ def open_run(
         InputError: the folder is in use, is occupied by another run, or cannot be written.
     """
     identity = run_identity(config)
+    for place in (job_folder, config.resume, config.paths.output_dir, config.paths.root_dir):
+        if not is_plain(str(place)):
+            raise InputError(
+                f"The run folder {place} has a name that is not UTF-8 or holds control characters, which TensorBoard "
+                "cannot write to. Rename it, or give another folder with paths.output_dir=DIR."
+            )
     folder, resuming = _choose(config, identity, num_steps, job_folder)
     if (folder / "run.json").exists():
         _require_same_run(folder, identity, set(map(key_of, typed)), resuming)

@@ -1,6 +1,7 @@
 """Folders of runs and sweeps from strangers: what they would repeat, and where their links would make us write."""
 
 import json
+import os
 import sys
 
 import pytest
@@ -205,6 +206,14 @@ def test_values_that_are_paths_name_no_folders(tmp_path):
     assert asked[-1] == OWN
 
 
+def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
+    planted = ("scene=llff", "scene.root=absent", "scene.name=a,b", "scene.name=../../../ESCAPED")
+    leave("sweep", tmp_path / "x" / "sweep", *planted)
+    result = nerf("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}/x/sweep")
+    assert "1 of 1 jobs failed. 0_scene.name=.._.._.._ESCAPED: The folder absent does not exist" in result.err
+    assert "Traceback" not in result.err
+
+
 def test_what_the_user_types_again_is_the_users(run):
     leave("run", run, "scene.cache_dir=/x", "seed=1")
     assert repeated("run", run, f"resume={run}", "scene.cache_dir=/y") == ["seed=1"]
@@ -327,6 +336,15 @@ def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
         with pytest.raises(InputError, match="symbolic link"):
             open_run(composed("train", f"paths.output_dir={tmp_path}/here", f"resume={resume}"), 100, None)
     assert (tmp_path / "victim").read_text() == "precious"
+
+
+@pytest.mark.parametrize("key", ["output_dir", "root_dir"])
+def test_a_run_folder_that_no_event_file_can_lie_in_is_refused(tmp_path, key):
+    """TensorBoard's writer encodes the path as UTF-8."""
+    place = tmp_path / os.fsdecode(b"x\xff")
+    with pytest.raises(InputError, match=r"The run folder .* has a name that is not UTF-8 or holds control"):
+        open_run(OmegaConf.merge(composed("train"), {"paths": {key: str(place)}}), 100, None)
+    assert not place.exists()
 
 
 def test_more_overrides_than_agreed_are_not_read(run):

@@ -113,5 +113,5 @@ def test_a_folder_is_described_with_what_is_no_file_in_it(tmp_path):
         "b (a device), c (a symbolic link to nowhere, which leads nowhere), "
         "d (a symbolic link to d, which leads nowhere), images, poses.npy, transforms.json (a named pipe (FIFO))"
     )
-    with pytest.raises(InputError, match=r"c is a symbolic link to nowhere, which leads nowhere; the folder holds b"):
+    with pytest.raises(InputError, match=r"c is a symbolic link to nowhere, which leads nowhere. Put"):
         read_bytes(tmp_path / "c", 10)

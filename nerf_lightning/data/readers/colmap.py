@@ -242,7 +242,7 @@ def models_in(root: Path) -> list[Path]:
     for place in MODEL_FOLDERS:
         folder = root / place
         below = sorted(path for path in folder.iterdir() if path.is_dir()) if place and folder.is_dir() else []
-        found = [path for path in (*below, folder) if any((path / f"cameras{e}").is_file() for e in KINDS)]
+        found = [path for path in (*below, folder) if any(os.path.lexists(path / f"cameras{e}") for e in KINDS)]
         found = [path for path in found if path not in models]
         models += sorted(found, key=_number_of_images, reverse=True) if len(found) > 1 else found
     return models
