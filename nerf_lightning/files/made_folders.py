@@ -15,7 +15,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from nerf_lightning.files.regular import not_private
+from nerf_lightning.files.regular import require_own
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import is_plain, listed
@@ -78,16 +78,14 @@ def make_own_folder(folder: Path, setting: str = CACHE_SETTING) -> None:
         InputError: it belongs to somebody else or can be written by others; `setting` names another one.
         OSError: it cannot be made.
     """
-    missing = [folder]
-    while not missing[-1].parent.exists():
-        missing.append(missing[-1].parent)
-    for place in reversed(missing):
-        place.mkdir(mode=0o700, exist_ok=True)
-    if reason := not_private(os.stat(folder)):
-        raise InputError(
-            f"The folder {folder} {reason}, so its contents may come from somebody else. If you made it and everything "
-            f"in it, make it private (chmod 700 '{folder}'); otherwise choose a folder of your own with {setting}."
-        )
+    if not folder.parent.exists():
+        make_own_folder(folder.parent, setting)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    cure = (
+        f"If you made it and everything in it, make it private (chmod 700 '{folder}'); otherwise choose a folder of "
+        f"your own with {setting}."
+    )
+    require_own(folder, os.stat(folder), cure)
 
 
 def require_no_way_out(folder: Path) -> None:

@@ -9,8 +9,7 @@ import codecs
 import io
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from nerf_lightning.messages.errors import InputError
@@ -29,6 +28,7 @@ KINDS = {
     stat.S_IFLNK: "a symbolic link",
 }
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
+MADE_AGAIN = "Remove it, and it will be made again."
 MOST_NAMES = 10  # Of a folder, in a message
 OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -48,51 +48,41 @@ def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_li
 
     Raises:
         AbsentError: there is none.
-        InputError: it is no regular file, is larger, or is a link that is not followed.
-        OSError: it cannot be opened.
+        InputError: it is no regular file, is larger, is a link that is not followed, or cannot be opened.
     """
     return os.fdopen(_opened(path, os.O_RDONLY, most_bytes, cure, follow_links), "rb")
 
 
 def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
-    """Open a regular file for writing at its end; it is made where there is none. Links are not followed.
-
-    Raises:
-        InputError: it is no regular file.
-        OSError: it cannot be opened.
-    """
+    """Open a regular file for writing at its end, or make it; see `open_regular`. Links are not followed."""
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
 
 
 def open_own(path: Path, most_bytes: int | None) -> io.BufferedReader:
-    """Open a regular file as `open_regular` does that only the user can have written, if the folder is the user's own.
-
-    Raises:
-        InputError: it belongs to somebody else or can be written by others, too.
-    """
-    file = open_regular(path, most_bytes, "Remove it, and it will be made again.", follow_links=False)
-    if reason := not_private(os.fstat(file.fileno())):
+    """Open a file of a folder that is the user's own (see `open_regular`); others' files are refused, and links."""
+    file = open_regular(path, most_bytes, MADE_AGAIN, follow_links=False)
+    try:
+        require_own(path, os.fstat(file.fileno()), MADE_AGAIN)
+    except InputError:
         file.close()
-        raise InputError(f"{path} {reason}, so it may come from somebody else. Remove it, and it will be made again.")
+        raise
     return file
 
 
-def not_private(state: os.stat_result) -> str | None:
-    """Return in words what keeps a file or folder from being the user's alone, None where it is; on Windows always."""
-    if os.name != "posix":
-        return None
-    if state.st_uid != os.geteuid():
-        return f"belongs to another user (number {state.st_uid})"
+def require_own(path: Path, state: os.stat_result, cure: str) -> None:
+    """Refuse a file or folder that somebody else can have written; Windows does not tell."""
     mode = stat.S_IMODE(state.st_mode)
-    return f"can be written by others (mode {mode:04o})" if mode & OTHERS_MAY_WRITE else None
+    if os.name == "posix" and (state.st_uid != os.geteuid() or mode & OTHERS_MAY_WRITE):
+        strange = f"belongs to another user (number {state.st_uid})" if state.st_uid != os.geteuid() else ""
+        reason = strange or f"can be written by others (mode {mode:04o})"
+        raise InputError(f"{path} {reason}, so it may come from somebody else. {cure}")
 
 
 def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
     """Return the content of a regular file."""
-    with explained(path, cure), open_regular(path, most_bytes, cure) as file:
+    with open_regular(path, most_bytes, cure) as file:
         content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:  # it has grown
-        raise InputError(_too_large(path, len(content), most_bytes, cure))
+        _require_regular(path, os.fstat(file.fileno()), most_bytes, cure)  # it may have grown
     return content
 
 
@@ -111,15 +101,6 @@ def encoding_of(file: io.BufferedIOBase) -> str:
     start = file.read(2)
     file.seek(0)
     return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
-
-
-@contextmanager
-def explained(path: Path, cure: str = CURE) -> Iterator[None]:
-    """Say of a file that cannot be opened or read what to do about it."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}. {cure}") from error
 
 
 def what_is(path: Path) -> str:
@@ -155,10 +136,9 @@ def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_li
         with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
             _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
         if isinstance(error, PermissionError) or os.path.exists(path):
-            raise
-        reason = what_is(path)
+            raise InputError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}. {cure}") from error
         held = "" if os.path.islink(path) else f"; the folder holds {contents(path.parent)}"
-        raise AbsentError(f"{path} {reason}{held}. Put the file there, or give another path.") from error
+        raise AbsentError(f"{path} {what_is(path)}{held}. Put the file there, or give another path.") from error
     try:
         _require_regular(path, os.fstat(handle), most_bytes, cure)
     except BaseException:
@@ -172,8 +152,4 @@ def _require_regular(path: Path, state: os.stat_result, most_bytes: int | None, 
         kind = KINDS.get(stat.S_IFMT(state.st_mode), "no regular file")
         raise InputError(f"{path} is {kind}, and only regular files are opened here. {cure}")
     if most_bytes is not None and state.st_size > most_bytes:
-        raise InputError(_too_large(path, state.st_size, most_bytes, cure))
-
-
-def _too_large(path: Path, size: int, most_bytes: int, cure: str) -> str:
-    return f"{path} has {size:,} bytes, more than the limit of {most_bytes:,}. {cure}"
+        raise InputError(f"{path} has {state.st_size:,} bytes, more than the limit of {most_bytes:,}. {cure}")

@@ -45,40 +45,32 @@ class Auth:
         if len(values("Host")) != 1:
             return HTTPStatus.BAD_REQUEST, "A request must have one Host header."
         host, origin = (", ".join(values(name)).lower() for name in ("Host", "Origin"))
-        name, source = _name_of(host), origin.partition("://")[2]
+        source = origin.partition("://")[2]
+        name, from_name = (match[1] if (match := HOST.fullmatch(each)) else None for each in (host, source))
         if name not in self._known:
             hint = f": if it is yours, start nerf with viewer.hosts=[{name}]" if name else ""
             return HTTPStatus.FORBIDDEN, f"The page is not served under this name{hint}."
-        if origin and source != host and _name_of(source) not in self._given:
+        if origin and source != host and from_name not in self._given:
             return HTTPStatus.FORBIDDEN, FOREIGN
         cookies = [pair.strip() for header in values("Cookie") for pair in header.split(";")]
         in_query = _holds(path.partition("?")[2].split("&"), f"token={self.token}")
-        return None if in_query or _holds(cookies, self._pair(port)) else (HTTPStatus.FORBIDDEN, NO_TOKEN)
+        return None if in_query or _holds(cookies, self.cookie(port)) else (HTTPStatus.FORBIDDEN, NO_TOKEN)
 
     def cookie(self, port: int) -> str:
-        """Return the header that keeps the token in the browser: no other site's request carries it."""
-        return f"{self._pair(port)}; HttpOnly; SameSite=Strict; Path=/"
-
-    def _pair(self, port: int) -> str:
-        # Browsers keep the cookies of one machine together, whatever the port.
+        """Return what keeps the token in the browser, which has the cookies of one machine together for all ports."""
         return f"nerf_lightning_{port}={self.token}"
 
 
 def names_of(hosts: Sequence[str] | str | None) -> set[str]:
     """Return the names in `viewer.hosts`, without their ports; what is no name is refused."""
-    given = [hosts] if isinstance(hosts, str | int) else hosts or ()
-    names = {each: _name_of(str(each).lower()) for each in given}
-    for each in (each for each, name in names.items() if name is None):
+    found = {
+        each: HOST.fullmatch(str(each).lower()) for each in ([hosts] if isinstance(hosts, str | int) else hosts or ())
+    }
+    for each in (each for each, match in found.items() if match is None):
         raise InputError(
             f"viewer.hosts: {each!r} is not the name of a machine: give names such as castle.example or 192.168.1.5."
         )
-    return set(filter(None, names.values()))
-
-
-def _name_of(host: str) -> str | None:
-    """Return the name in a host that may have a port, or None where it is none."""
-    found = HOST.fullmatch(host)
-    return found[1] if found else None
+    return {match[1] for match in found.values() if match}
 
 
 def _holds(given: list[str], secret: str) -> bool:

@@ -74,6 +74,6 @@ def _answer(
     if response is not None:
         if refusal is None:
             host = request.headers["Host"]
-            response.headers["Set-Cookie"] = auth.cookie(port)
+            response.headers["Set-Cookie"] = f"{auth.cookie(port)}; HttpOnly; SameSite=Strict; Path=/"
         response.headers.update(HEADERS | {"Content-Security-Policy": POLICY.format(host=host)})
     return response
