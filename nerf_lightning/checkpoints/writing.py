@@ -1,6 +1,5 @@
 """Checkpoint files that are whole at every moment: a crash leaves the old one or the new one, never half of one."""
 
-import contextlib
 import os
 from pathlib import Path
 from typing import Any
@@ -8,12 +7,12 @@ from typing import Any
 import torch
 
 from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
-from nerf_lightning.files.atomic import FULL
+from nerf_lightning.files.atomic import FULL, whole_file
 from nerf_lightning.messages.errors import InputError
 
 
 def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
-    """Write to a temporary file in the same folder, force it to the disk, then rename.
+    """Write a whole file and force it to the disk before it takes its name.
 
     `last.ckpt` becomes `previous.ckpt` before the new one takes its name. Lightning's own way goes through the system's
     temporary folder, and a move across file systems is not atomic.
@@ -21,30 +20,18 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
     Raises:
         InputError: the disk is full or the folder cannot be written; the former checkpoint is as it was.
     """
-    part = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
-        part.unlink(missing_ok=True)
-        with part.open("xb") as file:  # not through a link of this name
-            torch.save(checkpoint, file)
-            file.flush()
-            os.fsync(file.fileno())
-        if target.name == LAST and target.exists():
-            _keep(target, target.with_name(PREVIOUS))
-        os.replace(part, target)
+        with whole_file(target) as part:
+            with part.open("wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            if target.name == LAST and target.exists():
+                _keep(target, target.with_name(PREVIOUS))
         _sync_folder(target.parent)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        if isinstance(error, (OSError, RuntimeError)):
-            raise _cannot_save(target, error) from error
-        raise
-
-
-def sweep_leftovers(folder: Path) -> None:
-    """Remove the temporary files that a killed process left in a checkpoint folder."""
-    for leftover in folder.glob(".*.ckpt.*.tmp"):
-        leftover.unlink(missing_ok=True)
+    except (OSError, RuntimeError) as error:
+        raise _cannot_save(target, error) from error
 
 
 def _keep(last: Path, previous: Path) -> None:

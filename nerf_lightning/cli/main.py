@@ -192,6 +192,5 @@ def explained(command: str) -> Iterator[None]:
 def _complain(message: str) -> None:
     # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
     # Libraries say some things in several lines.
-    shown = for_terminal(message[:MOST_LETTERS].replace("\n", " "))
-    print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
+    print(f"nerf: {for_terminal(message.replace(chr(10), ' '), MOST_LETTERS)}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 
 from nerf_lightning.messages.errors import InputError
 
@@ -33,6 +34,7 @@ def main() -> None:
         from nerf_lightning.cli.main import main as answer
 
         keep_from_subprocesses()
+        write_any_name()
         answer()
 
 
@@ -122,6 +124,15 @@ def _silence(descriptor: int) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)
+
+
+def write_any_name() -> None:
+    """Let names that the encoding of a stream lacks be written as Python writes them, here and in subprocesses."""
+    encoding = os.environ.get("PYTHONIOENCODING", "").partition(":")[0]
+    os.environ["PYTHONIOENCODING"] = f"{encoding}:backslashreplace"
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def keep_from_subprocesses() -> None:

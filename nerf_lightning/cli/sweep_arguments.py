@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 FLAGS = ("-m", "--multirun")
 FOLDER_KEYS = ("paths.output_dir", "hydra.sweep.dir")
+JOB_FOLDER = "hydra.sweep.subdir"
 
 
 def is_sweep(arguments: list[str]) -> bool:
@@ -29,7 +30,7 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     With `sweep.resume=true` what the sweep was started with comes first.
 
     >>> sweep_arguments(["-m", "seed=0,1", "paths.output_dir=out"])
-    ['-m', 'seed=0,1', 'hydra.sweep.dir=out', "hydra.sweep.subdir='${hydra.job.num}_seed=${seed}'"]
+    ['-m', 'seed=0,1', 'hydra.sweep.dir=out', 'hydra.sweep.subdir=\\'${file_name:"${hydra.job.num}_seed=${seed}"}\\'']
     """
     resuming = (_value(arguments, "sweep.resume") or "").lower() == "true"
     if not is_sweep(arguments):
@@ -41,22 +42,26 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
             "hydra/launcher=slurm submits its jobs with Slurm's srun, which is not found here. Start the sweep where "
             "srun is (a login node of the cluster), or run its jobs on this machine: hydra/launcher=parallel."
         )
-    from nerf_lightning.runs.sweep_record import JOB_NUMBER
+    from omegaconf import OmegaConf
 
+    from nerf_lightning.files.made_folders import file_name
+
+    OmegaConf.register_new_resolver("file_name", file_name, replace=True)  # Hydra hands it to the jobs
     # Hydra reads -m only before the overrides.
     arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
-    if any(argument.startswith("hydra.sweep.subdir=") for argument in arguments):
-        return renamed
     current = {key: f"hydra.runtime.choices.{key}" if option_names(key) else key for key in _swept(arguments)}
-    parts = [JOB_NUMBER, *(f"{key}=${{{value}}}" for key, value in current.items())]
-    return [*renamed, f"hydra.sweep.subdir='{'_'.join(parts)}'"]
+    parts = ["${hydra.job.num}", *(f"{key}=${{{value}}}" for key, value in current.items())]
+    # A value may hold anything, and may be from the sweep's folder: no job's folder lies deeper, or elsewhere.
+    name = (_value(arguments, JOB_FOLDER) or "_".join(parts)).replace("'", "").replace('"', "")
+    others = [argument for argument in renamed if not argument.startswith(f"{JOB_FOLDER}=")]
+    return [*others, f"{JOB_FOLDER}='${{file_name:\"{name}\"}}'"]
 
 
 def _with_former(arguments: list[str], resuming: bool) -> list[str]:
     """Put what the sweep was started with before the user's own."""
     from nerf_lightning.compute.slurm import was_requeued
-    from nerf_lightning.files.links import require_no_way_out
+    from nerf_lightning.files.made_folders import require_no_way_out
 
     folder = _value(arguments, *FOLDER_KEYS)
     if folder is None and was_requeued() and not resuming:
@@ -89,8 +94,9 @@ def _resumed(arguments: list[str], folder: str | None) -> list[str]:
 def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
     from nerf_lightning.compute.slurm import slurm_job
     from nerf_lightning.config.overrides import open_sections
+    from nerf_lightning.runs.sweep_record import MADE
 
-    asked = set(open_sections(argument for argument in arguments if not argument.startswith("-")))
+    asked = set(open_sections(argument for argument in arguments if not argument.startswith(("-", *MADE))))
     same = (f for f, record in _sweeps(arguments) if record.slurm_job == slurm_job() and set(record.typed()) == asked)
     return next(same, None)
 

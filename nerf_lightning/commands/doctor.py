@@ -19,6 +19,7 @@ from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StdoutConsole, say, spoken
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.runs.output_folder import output_folder
@@ -34,7 +35,7 @@ def run(config: DictConfig) -> int:
     reader = build(config.scene)
     scene = reader.read()
     about = about_capture(scene, *_origin(config, reader))
-    default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    default = child_of(Path(config.paths.root_dir), scene.name, f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}")
     folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
     rows = [{key: getattr(check, key) for key in ("name", "verdict", "message", "cure")} for check in checks]

@@ -14,6 +14,7 @@ from nerf_lightning.data.sfm.find_poses import from_photographs, from_video, req
 from nerf_lightning.data.sfm.reconstruction import require_pycolmap
 from nerf_lightning.data.sfm.settings import SfmSettings
 from nerf_lightning.data.sfm.summary import summary_lines
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.runs.folder import job_folder
@@ -27,7 +28,7 @@ def run(config: DictConfig) -> int:
     require_pycolmap()
     is_video = config.video is not None
     name = source.resolve().stem if is_video else source.resolve().name
-    folder = job_folder() or Path(config.paths.output_dir or Path(config.paths.root_dir) / "poses" / name)
+    folder = job_folder() or Path(config.paths.output_dir or child_of(Path(config.paths.root_dir), "poses", name))
     require_new_capture(folder, source, is_video)
     if is_video:
         require_ffmpeg()

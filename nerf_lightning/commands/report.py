@@ -9,7 +9,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
-from nerf_lightning.files.links import require_nothing_from_outside
+from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.report.page import write_report
@@ -26,7 +26,7 @@ def run(config: DictConfig) -> str:
         raise InputError(
             f"run={run} is not a run folder: it has no run.json. Give one, such as outputs/bricks/2026-11-21_10-00-00."
         )
-    require_nothing_from_outside(run)
+    require_no_way_out(run)
     target = output_folder(config.paths.output_dir, run) / "report.html"
     most_video_bytes = int(config.max_megabytes * 1e6)
     doctor = partial(_examine_capture, config) if config.doctor else None

@@ -13,8 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.files.atomic import full_disk_named
-from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.escaping import for_file_name
+from nerf_lightning.files.made_folders import child_of, file_name, make_folder
 from nerf_lightning.visualization.pictures import mosaic, panels, save_png
 
 PARTS = ("truth", "render", "depth", "error")
@@ -89,7 +88,7 @@ class KeptViews:
                 save_png(folder / f"{part}.png", picture)
                 yield part, picture
 
-        save_png(self.folder / "images" / f"{name}.png", mosaic(saved()))
+        save_png(child_of(self.folder, "images", name, ending=".png"), mosaic(saved()))
 
 
 def picture_name(split: str, view_name: str) -> str:
@@ -98,5 +97,5 @@ def picture_name(split: str, view_name: str) -> str:
     >>> picture_name("test", "r_0"), picture_name("test", "test/r_0")
     ('test_r_0', 'test_r_0')
     """
-    plain = for_file_name(view_name)
+    plain = file_name(view_name)
     return plain if plain.startswith(f"{split}_") else f"{split}_{plain}"

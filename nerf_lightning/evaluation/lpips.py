@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.files.trust import reading, require_fit
 from nerf_lightning.messages.errors import InputError
@@ -88,7 +89,7 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
         return None
     path, cure = Path(weights), f"To have LPIPS, {LPIPS_HINT}"
     if not path.is_file():
-        raise InputError(f"evaluation.lpips_weights={weights}: there is no such file. {cure}")
+        raise InputError(f"evaluation.lpips_weights={weights}: {path} {what_is(path)}. {cure}")
     model = LPIPS(net)
     template = model.state_dict()
     with reading(path, cure):

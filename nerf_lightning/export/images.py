@@ -16,10 +16,9 @@ from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
-from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.files.made_folders import child_of, file_name, make_folder
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import for_file_name
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
 from nerf_lightning.nerf.geometry.frames import directions_to_user, told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -65,27 +64,27 @@ class ImagesExport(Export):
         require_free(files=[folder / "images.json"], folders=[folder / name for name in KINDS])
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)
-        names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
+        names = {view: _file_name(view, record.view_names[view]) for view in views}
         depths, opacities, directions = (make_folder(folder, name) for name in KINDS)
         farthest, channels = 0.0, dict[str, Path]()
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):
                 seen = see(model, record, record.cameras, view, tile_points)
                 depth = self._depth(seen, record, view)
-                _save_array(depths / f"{names[view]}.npy", depth)
+                _save_array(child_of(depths, names[view], ending=".npy"), depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
-                save_png(opacities / f"{names[view]}.png", to_bytes(seen.opacity))
+                save_png(child_of(opacities, names[view], ending=".png"), to_bytes(seen.opacity))
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
-                save_png(directions / f"{names[view]}.png", to_bytes(normals))
+                save_png(child_of(directions, names[view], ending=".png"), to_bytes(normals))
                 for name, values in seen.channels.items():
                     channels[name] = make_folder(folder, name)
-                    _save_array(channels[name] / f"{names[view]}.npy", values.numpy())
+                    _save_array(child_of(channels[name], names[view], ending=".npy"), values.numpy())
                 report("pictures", (number + 1) / len(views))
             in_millimetres = record.metres_per_unit is not None and farthest <= MILLIMETRE * LARGEST
             scale = MILLIMETRE if in_millimetres else farthest / LARGEST or 1.0
             for number, view in enumerate(views):
-                depth = np.nan_to_num(np.load(depths / f"{names[view]}.npy"), nan=0.0)
-                with whole_file(depths / f"{names[view]}.png") as part:
+                depth = np.nan_to_num(np.load(child_of(depths, names[view], ending=".npy")), nan=0.0)
+                with whole_file(child_of(depths, names[view], ending=".png")) as part:
                     Image.fromarray(np.rint(depth / scale).astype(np.uint16)).save(part, format="PNG")
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
@@ -122,10 +121,11 @@ class ImagesExport(Export):
         }
 
 
-def _plain(name: str) -> str:
-    # A name comes from a file: no folders in it, and no ending of a photograph.
-    plain = for_file_name(name)
-    return plain[: -len(Path(plain).suffix)] if Path(plain).suffix.lower() in ENDINGS else plain
+def _file_name(view: int, name: str) -> str:
+    """Return what the files of a view are called, without their ending and that of the photograph."""
+    ending = Path(name).suffix
+    stem = name.removesuffix(ending) if ending.lower() in ENDINGS else name
+    return file_name(f"{view:04d}_{stem}", ".png").removesuffix(".png")
 
 
 def _save_array(path: Path, array: Float[ndarray, "height width *channels"]) -> None:

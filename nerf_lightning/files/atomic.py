@@ -2,27 +2,32 @@
 
 import errno
 import os
+import platform
 import re
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+import psutil
+
 from nerf_lightning.files.made_folders import make_folder
 
 try:
     import fcntl
-except ImportError:  # Windows: what killed processes leave there stays
+except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 NO_ROOM = (*FULL, errno.EFBIG)  # A file may also be larger than is allowed
-_PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
+MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"  # Folders are shared between machines
+PART = re.compile(r"\..*\.(\d{1,9})_([0-9a-f]{8})\.nerf_lightning\.part(\.[^.]+)?", re.DOTALL)
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Lend a temporary path beside `path` that takes its place when the block ends well, else is removed.
+def whole_file(path: Path, mode: int = 0o666) -> Iterator[Path]:
+    """Lend a temporary path next to `path` that takes its place when the block ends well, else is removed.
 
     A missing folder is made; below one that the user named, `make_folder` does it first, and refuses links. The
     temporary name keeps the suffix, since writers choose a format by it. What killed processes left in the folder is
@@ -30,10 +35,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     make_folder(path.parent)
     _sweep(path.parent)
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    part = path.with_name(f".{path.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{path.suffix}")
     try:
         part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
-        with full_disk_named(path), _held(part):
+        with full_disk_named(path), _held(part, mode):
             yield part
             os.replace(part, path)
     except OSError as error:
@@ -59,31 +64,26 @@ def full_disk_named(place: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _held(part: Path) -> Iterator[None]:
+def _held(part: Path, mode: int) -> Iterator[None]:
     """Make the file, and hold it locked: its writer is alive."""
     if fcntl is None:
         yield
         return
-    handle = _locked(part)
+    while True:
+        handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if _is_at(handle, part):
+            break
+        os.close(handle)  # another process took it for a dead one's, and removed it
     try:
         yield
     finally:
         os.close(handle)
 
 
-def _locked(part: Path) -> int:
-    """Make a file and lock it; where another process takes it for a dead one's in between, and removes it, again."""
-    while True:
-        handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX)  # whoever sweeps holds it for a moment
-        if _is_at(handle, part):
-            return handle
-        os.close(handle)
-
-
 def _is_at(handle: int, path: Path) -> bool:
-    """Tell whether an open file is still the one of this name."""
+    """Return whether an open file is still the one of this name."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path, follow_symlinks=False))
     except FileNotFoundError:
@@ -92,16 +92,24 @@ def _is_at(handle: int, path: Path) -> bool:
 
 @cache
 def _sweep(folder: Path) -> None:
-    """Remove the temporary files that nobody holds, once in a process's life."""
-    if fcntl is None:
-        return
+    """Remove the temporary files whose writers are dead, once in a process's life."""
     for part in folder.iterdir():
-        if _PART.fullmatch(part.name) and part.is_file():
+        if (name := PART.fullmatch(part.name)) and part.is_file():
             with suppress(OSError):  # held by another process, gone meanwhile, or another user's
-                handle = os.open(part, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if _is_at(handle, part):
-                        part.unlink()
-                finally:
-                    os.close(handle)
+                _remove_dead(part, has_ended=name[2] == MACHINE and not psutil.pid_exists(int(name[1])))
+
+
+def _remove_dead(part: Path, has_ended: bool) -> None:
+    """Remove a temporary file unless its writer holds the lock; where there are no locks, if its process has ended."""
+    if fcntl is None:
+        if has_ended:
+            part.unlink()
+        return
+    with os.fdopen(os.open(part, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK), "r+b") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if isinstance(error, BlockingIOError) or not has_ended:
+                raise
+        if _is_at(file.fileno(), part):
+            part.unlink()

@@ -1,51 +1,103 @@
-"""Folders that are written into are made here, and emptied and removed here alone.
+"""Places that are written to: named, made, emptied and removed here alone.
 
-An unpacked archive can bring links, and a person may have a folder of the name that we give to one of ours. So nothing
-is reached through a link below the folder that the user named (which may be a link itself: it is the user's own word),
-and only a folder in which a file says that this program made it is ever emptied.
+A name may hold what anybody has chosen (a scene, a photograph, a setting), an unpacked archive can bring links, and a
+person may have a folder of the name that we give to one of ours. So a name leads nowhere, nothing is reached through a
+link below the folder that the user named (which may be a link itself: it is the user's own word), and only a folder in
+which a file says that this program made it is ever emptied.
 """
 
+import hashlib
+import os
+import re
 import shutil
 from contextlib import suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from nerf_lightning.files.regular import require_own
+from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed
+from nerf_lightning.messages.escaping import is_plain, listed
 
 MARK = ".made_by_nerf_lightning"  # An empty file in each folder that may be emptied
 LOCK = "lock"
+LONGEST_NAME = 200  # In bytes; file systems take 255, and temporary names are longer
+DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d|conin\$|conout\$) *(\..*)?", re.IGNORECASE)  # Windows' names
+CACHE_SETTING = "NERF_LIGHTNING_CACHE or scene.cache_dir"
 
 
-def below(root: Path, *names: str) -> Path:
-    """Return a place in a folder that the user named (it may be a link), which is reached through no link."""
-    place = root
-    for name in names:
-        place = place / name
+def file_name(value: str, ending: str = "") -> str:
+    r"""Return a value as a name that any file system takes for a file or folder in the folder that it is put into.
+
+    >>> file_name("../a\x00:b", ".png"), file_name(".."), file_name("con.txt")
+    ('.._a__b.png', '_', '_con.txt')
+    """
+    name = "".join("_" if letter in '/\\<>:"|?*' or not is_plain(letter) else letter for letter in value)
+    if len((name + ending).encode()) > LONGEST_NAME:  # the digest keeps names apart that begin alike
+        digest = hashlib.sha256(value.encode(errors="surrogatepass")).hexdigest()[:8]
+        name = f"{name.encode()[: LONGEST_NAME - 9 - len(ending)].decode(errors='ignore')}~{digest}"
+    name = f"_{name}{ending}" if DEVICE.fullmatch(name + ending) else name + ending
+    bare = name.rstrip(". ")  # which Windows leaves out
+    return name if name == bare != "" else f"{bare}_"
+
+
+def child_of(folder: Path, *names: str, ending: str = "") -> Path:
+    """Return the place in a folder that is called by a value, or by several, each within the one before.
+
+    Raises:
+        InputError: a link leads there.
+    """
+    place = folder
+    for number, name in enumerate(names, start=1):
+        place = place / file_name(name, ending if number == len(names) else "")
         if place.is_symlink():
             raise InputError(
-                f"{place} is a symbolic link to {place.readlink()}, so writing into {root} would write there. Remove "
+                f"{place} is a symbolic link to {place.readlink()}, so writing into {folder} would write there. Remove "
                 "the link, or give another folder with paths.output_dir=DIR."
             )
     return place
 
 
-def make_folder(root: Path, *names: str) -> Path:
-    """Make a folder as `below` returns it, and those around it that are missing; one that is there is taken.
+def make_folder(root: Path, *names: str, new: bool = False) -> Path:
+    """Make the folder that `child_of` returns, and those around it that are missing; one that exists is taken.
 
     Raises:
         InputError: a link leads there.
-        OSError: it cannot be made.
+        OSError: it cannot be made, or exists and is to be `new`.
     """
-    folder = below(root, *names)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = child_of(root, *names)
+    folder.mkdir(parents=True, exist_ok=not new)
     return folder
 
 
-def make_new_folder(folder: Path) -> None:
-    """Make a folder of a name that nothing has, and those around it that are missing."""
-    folder.mkdir(parents=True)
+def make_own_folder(folder: Path, setting: str = CACHE_SETTING) -> None:
+    """Make a folder, and those above it that are missing, for the user alone (mode 0700).
+
+    Raises:
+        InputError: it belongs to somebody else or can be written by others; `setting` names another one.
+        OSError: it cannot be made.
+    """
+    if not folder.parent.exists():
+        make_own_folder(folder.parent, setting)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    cure = (
+        f"If you made it and everything in it, make it private (chmod 700 '{folder}'); otherwise choose a folder of "
+        f"your own with {setting}."
+    )
+    require_own(folder, os.stat(folder), cure)
+
+
+def require_no_way_out(folder: Path) -> None:
+    """Refuse to write into a folder, or to show one, with links that lead out of it: an archive may bring them."""
+    root = os.path.realpath(folder)
+    for base, folders, names in walk(Path(root)):
+        for path in (base / name for name in (*folders, *names)):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
+                raise InputError(
+                    f"{path} is a symbolic link to {os.readlink(path)}, which lies outside of {folder}, so it would be "
+                    "written to, or shown. Remove the link, or replace it with what it points to."
+                )
 
 
 def remove_empty(*folders: Path) -> None:
@@ -56,7 +108,7 @@ def remove_empty(*folders: Path) -> None:
 
 
 def make_ours(root: Path, *names: str, files: str = "*") -> Path:
-    """Make a folder as `below` returns it, whose `files` (a pattern) will be removed again, and mark it as ours.
+    """Make a folder as `make_folder` does, whose `files` (a pattern) will be removed again, and mark it as ours.
 
     Raises:
         InputError: a link leads there, or it has such files and no mark.
@@ -113,7 +165,7 @@ class ScratchFolder:
             OSError: it cannot be made.
         """
         make_ours(self.root, self.path.name)
-        below(self.path, LOCK)
+        child_of(self.path, LOCK)
         try:
             self.lock.acquire(timeout=0)
         except Timeout as error:
@@ -122,15 +174,11 @@ class ScratchFolder:
                 "another folder with paths.output_dir=DIR."
             ) from error
 
-    def release(self) -> None:
-        """Let others have it, with what is in it."""
-        self.lock.release()
-
     def remove(self) -> None:
         """Remove it, as far as that can be, while it is held: the lock's file last, since then others may come."""
         with suppress(OSError):
             empty_ours(self.path)
             (self.path / MARK).unlink()
             (self.path / LOCK).unlink()
-        self.release()
+        self.lock.release()
         remove_empty(self.path)

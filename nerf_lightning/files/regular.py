@@ -1,32 +1,40 @@
 """Files of folders that anybody may have made: opened only where they are regular files, and of a bounded size.
 
 An archive can carry a FIFO, which is waited for without end, and a link can lead to a device. So a file is opened
-without waiting, and asked what it is once it is open: nobody can put another one in its place in between.
+without waiting, and checked once it is open: nobody can put another one in its place in between. Who needs a file opens
+it, and does not ask first whether it is there: what is in its place is explained here.
 """
 
 import codecs
-import errno
 import io
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 # Of posix; Windows has neither FIFOs nor devices among its files.
 WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 BINARY = getattr(os, "O_BINARY", 0)
-KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a named pipe (FIFO)"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe (FIFO)",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
+}
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
+MADE_AGAIN = "Remove it, and it will be made again."
+MOST_NAMES = 10  # Of a folder, in a message
+OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+class AbsentError(InputError):
+    """Report that there is no file at a path."""
 
 
 def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
@@ -39,28 +47,42 @@ def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_li
         follow_links: open what a symbolic link leads to; where it may lead is for the caller to say.
 
     Raises:
-        InputError: it is no regular file, is larger, or is a link that is not followed.
-        OSError: it cannot be opened.
+        AbsentError: there is none.
+        InputError: it is no regular file, is larger, is a link that is not followed, or cannot be opened.
     """
     return os.fdopen(_opened(path, os.O_RDONLY, most_bytes, cure, follow_links), "rb")
 
 
 def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
-    """Open a regular file for writing at its end; it is made where there is none. Links are not followed.
-
-    Raises:
-        InputError: it is no regular file.
-        OSError: it cannot be opened.
-    """
+    """Open a regular file for writing at its end, or make it; see `open_regular`. Links are not followed."""
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
+
+
+def open_own(path: Path, most_bytes: int | None) -> io.BufferedReader:
+    """Open a file of a folder that is the user's own (see `open_regular`); others' files are refused, and links."""
+    file = open_regular(path, most_bytes, MADE_AGAIN, follow_links=False)
+    try:
+        require_own(path, os.fstat(file.fileno()), MADE_AGAIN)
+    except InputError:
+        file.close()
+        raise
+    return file
+
+
+def require_own(path: Path, state: os.stat_result, cure: str) -> None:
+    """Refuse a file or folder that somebody else can have written; Windows does not tell."""
+    mode = stat.S_IMODE(state.st_mode)
+    if os.name == "posix" and (state.st_uid != os.geteuid() or mode & OTHERS_MAY_WRITE):
+        strange = f"belongs to another user (number {state.st_uid})" if state.st_uid != os.geteuid() else ""
+        reason = strange or f"can be written by others (mode {mode:04o})"
+        raise InputError(f"{path} {reason}, so it may come from somebody else. {cure}")
 
 
 def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
     """Return the content of a regular file."""
-    with explained(path, cure), open_regular(path, most_bytes, cure) as file:
+    with open_regular(path, most_bytes, cure) as file:
         content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:  # it has grown
-        raise InputError(_too_large(path, len(content), most_bytes, cure))
+        _require_regular(path, os.fstat(file.fileno()), most_bytes, cure)  # it may have grown
     return content
 
 
@@ -81,53 +103,53 @@ def encoding_of(file: io.BufferedIOBase) -> str:
     return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
-@contextmanager
-def explained(path: Path, cure: str = CURE) -> Iterator[None]:
-    """Say of a file that cannot be opened or read what to do about it."""
+def what_is(path: Path) -> str:
+    """Return what lies at a path, as the rest of a sentence that begins with it.
+
+    >>> what_is(Path("/")), what_is(Path("/nowhere"))
+    ('is a folder', 'does not exist')
+    """
     try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}. {cure}") from error
-    except ValueError as error:  # NUL
-        raise InputError(f"{path} cannot be read: {error}. {cure}") from error
+        return f"is {KINDS.get(stat.S_IFMT(os.stat(path).st_mode), 'a file')}"
+    except PermissionError:
+        return "cannot be accessed (permission denied)"
+    except (OSError, ValueError):  # NUL, too long, or a loop of links
+        is_link = os.path.islink(path)
+        return f"is a symbolic link to {os.readlink(path)}, which leads nowhere" if is_link else "does not exist"
+
+
+def contents(folder: Path) -> str:
+    """Return what a folder holds, in a few words: names, with what they are where that is neither file nor folder."""
+    try:
+        names = sorted(os.listdir(folder))
+    except (OSError, ValueError) as error:  # it does not exist either
+        return f"nothing that can be read ({getattr(error, 'strerror', error)})"
+    kinds = [what_is(folder / name).removeprefix("is ") for name in names[:MOST_NAMES]]
+    notes = ["" if kind in ("a file", "a folder") else f" ({kind})" for kind in kinds]
+    return listed([*map(str.__add__, names, notes), *names[MOST_NAMES:]], MOST_NAMES) or "nothing"
 
 
 def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_links: bool) -> int:
-    link = 0 if follow_links else NO_LINK
     try:
-        handle = os.open(path, flags | WITHOUT_WAITING | BINARY | link, 0o666)
-    except OSError as error:
-        # A socket, or a pipe that nobody reads, cannot be opened; a link has an error of its own.
-        kind = "a symbolic link" if link and error.errno in (errno.ELOOP, errno.EMLINK) else _kind_by_name(path)
-        if kind is None:
-            raise
-        raise InputError(_of_another_kind(path, kind, cure)) from error
+        handle = os.open(path, flags | WITHOUT_WAITING | BINARY | (0 if follow_links else NO_LINK), 0o666)
+    except (OSError, ValueError) as error:
+        with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
+            _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
+        if isinstance(error, PermissionError) or os.path.exists(path):
+            raise InputError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}. {cure}") from error
+        held = "" if os.path.islink(path) else f"; the folder holds {contents(path.parent)}"
+        raise AbsentError(f"{path} {what_is(path)}{held}. Put the file there, or give another path.") from error
     try:
-        state = os.fstat(handle)
-        if not stat.S_ISREG(state.st_mode):
-            raise InputError(_of_another_kind(path, _kind(state.st_mode) or "no regular file", cure))
-        if most_bytes is not None and state.st_size > most_bytes:
-            raise InputError(_too_large(path, state.st_size, most_bytes, cure))
+        _require_regular(path, os.fstat(handle), most_bytes, cure)
     except BaseException:
         os.close(handle)
         raise
     return handle
 
 
-def _kind_by_name(path: Path) -> str | None:
-    try:
-        return _kind(os.stat(path).st_mode)
-    except OSError:
-        return None
-
-
-def _kind(mode: int) -> str | None:
-    return next((name for is_kind, name in KINDS if is_kind(mode)), None)
-
-
-def _of_another_kind(path: Path, kind: str, cure: str) -> str:
-    return f"{path} is {kind}, and only regular files are opened here. {cure}"
-
-
-def _too_large(path: Path, size: int, most_bytes: int, cure: str) -> str:
-    return f"{path} has {size:,} bytes, more than the limit of {most_bytes:,}. {cure}"
+def _require_regular(path: Path, state: os.stat_result, most_bytes: int | None, cure: str) -> None:
+    if not stat.S_ISREG(state.st_mode):
+        kind = KINDS.get(stat.S_IFMT(state.st_mode), "no regular file")
+        raise InputError(f"{path} is {kind}, and only regular files are opened here. {cure}")
+    if most_bytes is not None and state.st_size > most_bytes:
+        raise InputError(f"{path} has {state.st_size:,} bytes, more than the limit of {most_bytes:,}. {cure}")

@@ -23,15 +23,9 @@ def walk(root: Path, through_links: bool = False) -> Iterator[tuple[Path, list[s
         try:
             with os.scandir(base) as entries:
                 for entry in entries:
-                    (folders if _is_folder(entry) else names).append(entry.name)
+                    is_folder = os.path.isdir(entry) if entry.is_symlink() else entry.is_dir()
+                    (folders if is_folder else names).append(entry.name)
         except OSError:
             continue
         yield base, folders, names
         waiting += [base / name for name in reversed(folders) if through_links or not os.path.islink(base / name)]
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # a loop of links
-        return False

@@ -25,18 +25,18 @@ UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 JOINERS = "\u200c\u200d"
 NARROWEST = 60  # Columns that text is wrapped to
 MOST_CHARACTERS = 1024  # Of the name of a photograph or of a scene
-LONGEST_FILE_NAME = 200  # In bytes; file systems take 255, and endings are added
 
 
-def for_terminal(text: str) -> str:
-    r"""Return a text in one line that steers no terminal.
+def for_terminal(text: str, most: int | None = None) -> str:
+    r"""Return a text in one line that steers no terminal, cut after `most` characters.
 
     Control characters, ends of lines, marks that reverse the direction of writing, and lone surrogates are written as
     in Python.
 
-    >>> for_terminal("a\x1b[2Jb\nc")
-    'a\\x1b[2Jb\\nc'
+    >>> for_terminal("a\x1b[2Jb\nc"), for_terminal("abc", 2)
+    ('a\\x1b[2Jb\\nc', 'ab…')
     """
+    text = text if most is None or len(text) <= most else f"{text[:most]}…"
     return text if text.isprintable() else "".join(map(_visible, text))
 
 
@@ -62,6 +62,16 @@ def for_markdown(text: str) -> str:
     return ADDRESS.sub(lambda found: f"&#{ord(found[0])};", text)
 
 
+def as_code(text: str) -> str:
+    """Return a text as a code span of Markdown, where nothing is markup, HTML, a link, or, in MDX, a program.
+
+    >>> as_code("<b>`x`</b>")
+    '`` <b>`x`</b> ``'
+    """
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {for_terminal(text, 5000)} {fence}"
+
+
 def for_csv(value: Any) -> Any:
     r"""Return a value as a cell of a CSV file: a text that a spreadsheet would take for a formula is quoted.
 
@@ -80,17 +90,7 @@ def for_colmap(name: str) -> str:
     >>> for_colmap("a\u200db c.png\n2 1 0 0 0 0 0 0 1 d.png") == "a\u200db c.png\\n2 1 0 0 0 0 0 0 1 d.png"
     True
     """
-    return "".join(_as_in_python(letter) if _is_unprintable(letter) else letter for letter in name)
-
-
-def for_file_name(name: str) -> str:
-    r"""Return the name of a file that any file system takes, and that lies in the folder it is put into.
-
-    >>> for_file_name("../a\x00:b")
-    '.._a__b'
-    """
-    plain = "".join("_" if letter in '/\\<>:"|?*' or _is_unprintable(letter) else letter for letter in name)
-    return plain.encode()[:LONGEST_FILE_NAME].decode(errors="ignore")
+    return "".join(letter if is_plain(letter) else _as_in_python(letter) for letter in name)
 
 
 def terminal_width(otherwise: int) -> int:
@@ -99,8 +99,8 @@ def terminal_width(otherwise: int) -> int:
 
 
 def is_plain(name: str) -> bool:
-    """Tell whether a name is UTF-8 and holds no control characters."""
-    return not any(map(_is_unprintable, name))
+    """Return whether a name is UTF-8 and holds no control characters."""
+    return name.isprintable() or not any(unicodedata.category(letter) in UNPRINTABLE for letter in name)
 
 
 def require_printable(name: str, where: str) -> None:
@@ -134,10 +134,6 @@ def _visible(letter: str) -> str:
 
 def _as_in_python(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
-
-
-def _is_unprintable(letter: str) -> bool:
-    return not letter.isprintable() and unicodedata.category(letter) in UNPRINTABLE
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
 from nerf_lightning.evaluation.metrics_files import COLUMNS, as_text
 from nerf_lightning.files.json_files import mapping, number
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.embedding import embedded_file
@@ -88,7 +89,7 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
         pages.append([])
         for folder, name in folders:
             try:
-                pages[-1].append(_view(images / "views" / _plain(folder), name, rows.get(name, {})))
+                pages[-1].append(_view(child_of(images, "views", folder), name, rows.get(name, {})))
             except (InputError, OSError) as error:
                 missing.append(f"View {name[:80]}: {error}")
     if metrics and not worst and not spread:
@@ -101,12 +102,6 @@ def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
     known = {metric: _shown(metric, row.get(metric)) for metric in ("psnr", "ssim")}
     numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)
-
-
-def _plain(name: str) -> str:
-    if name != Path(name).name or name in ("", "..") or "\\" in name or "\0" in name:
-        raise InputError("its name is not a plain file name")
-    return name
 
 
 def _shown(metric: str, value: Any) -> str:

@@ -24,19 +24,17 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
-from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.key_meanings import fingerprint
 from nerf_lightning.config.overrides import key_of, leaves, to_type
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
-from nerf_lightning.files.links import require_no_way_out
-from nerf_lightning.files.made_folders import make_folder, make_new_folder, require_run
-from nerf_lightning.files.regular import open_to_append
+from nerf_lightning.files.made_folders import child_of, make_folder, require_no_way_out, require_run
+from nerf_lightning.files.regular import open_to_append, what_is
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import EscapingFormatter
+from nerf_lightning.messages.escaping import EscapingFormatter, is_plain
 from nerf_lightning.runs.identity import run_identity, settings_digest
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 
@@ -133,6 +131,12 @@ def open_run(
         InputError: the folder is in use, is occupied by another run, or cannot be written.
     """
     identity = run_identity(config)
+    for place in (job_folder, config.resume, config.paths.output_dir, config.paths.root_dir):
+        if not is_plain(str(place)):
+            raise InputError(
+                f"The run folder {place} has a name that is not UTF-8 or holds control characters, which TensorBoard "
+                "cannot write to. Rename it, or give another folder with paths.output_dir=DIR."
+            )
     folder, resuming = _choose(config, identity, num_steps, job_folder)
     if (folder / "run.json").exists():
         _require_same_run(folder, identity, set(map(key_of, typed)), resuming)
@@ -155,7 +159,6 @@ def open_run(
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
     settings = settings_digest(config if asked is None else asked)
     write_json(folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings} | kept | job)
-    sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
 
@@ -207,14 +210,14 @@ def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_fo
         length = num_steps, number(config.budget.seconds)
         folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), length, of_job)
     if folder is None:
-        return _fresh(Path(config.paths.root_dir) / config.scene.name), False
+        return _fresh(child_of(Path(config.paths.root_dir), str(config.scene.name))), False
     return folder, resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
 
 
 def _to_resume(path: Path) -> Path:
     folder = path.parent.parent if path.suffix == ".ckpt" else path
     if path.suffix == ".ckpt" and not path.is_file():
-        raise InputError(f"resume={path}: there is no such checkpoint. A run keeps last.ckpt and best.ckpt.")
+        raise InputError(f"resume={path}: {path} {what_is(path)}. A run keeps last.ckpt and best.ckpt.")
     if not (folder / "run.json").is_file():
         raise InputError(
             f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
@@ -311,8 +314,7 @@ def _fresh(parent: Path) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     for name in itertools.chain([stamp], (f"{stamp}_{count}" for count in itertools.count(2))):
         with contextlib.suppress(FileExistsError):
-            make_new_folder(parent / name)
-            return parent / name
+            return make_folder(parent, name, new=True)
     raise AssertionError("unreachable: the names never end")
 
 

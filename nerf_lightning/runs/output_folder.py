@@ -6,8 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.files.atomic import full_disk_named
-from nerf_lightning.files.links import require_no_way_out
-from nerf_lightning.files.made_folders import make_folder, remove_empty
+from nerf_lightning.files.made_folders import make_folder, remove_empty, require_no_way_out
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import job_folder
 

@@ -11,6 +11,7 @@ from nerf_lightning.config.key_meanings import PLACES, meaning_of
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import mapping, number, read_json_object
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
@@ -83,7 +84,7 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders in these folders, and what `nerf eval` wrote on its own, below each of these folders."""
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(f"runs={folder}: there is no such folder. Give run folders, or folders that hold some.")
+            raise InputError(f"runs={folder}: {folder} {what_is(folder)}. Give run folders, or folders that hold some.")
     found = list(dict.fromkeys(run for folder in folders for run in _runs_below(folder)))
     if not found:
         named = ", ".join(map(str, folders))

@@ -10,8 +10,7 @@ from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
-JOB_NUMBER = "${hydra.job.num}"
-MADE = ("hydra.mode=", "hydra.sweep.dir=", "sweep.", f"hydra.sweep.subdir='{JOB_NUMBER}")
+MADE = ("hydra.mode=", "hydra.sweep.", "sweep.")
 """What was made of the arguments, or belongs to one start: it is made again."""
 
 

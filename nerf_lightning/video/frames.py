@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.files.json_files import read_json_object, write_json
-from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_folder, make_ours
+from nerf_lightning.files.made_folders import ScratchFolder, child_of, empty_ours, make_folder, make_ours
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.encoding import write_animation, write_video
@@ -99,18 +99,18 @@ class FilmFrames:
 
     def close(self) -> None:
         """Let others have the folder; the frames stay."""
-        self.scratch.release()
+        self.scratch.lock.release()
 
     def results(self) -> list[Path]:
         """Return the files, or the folders of frames."""
-        return [self.folder / f"{film}{ENDINGS[self.form]}" for film in self.films]
+        return [child_of(self.folder, film, ending=ENDINGS[self.form]) for film in self.films]
 
     @property
     def _pattern(self) -> str:
         return f"frame_*{self.suffix}"
 
     def _file(self, film: str, number: int) -> Path:
-        return self.root / film / f"frame_{number:04d}{self.suffix}"
+        return child_of(self.root, film, f"frame_{number:04d}", ending=self.suffix)
 
     def _is_there(self, number: int) -> bool:
         files = [self._file(film, number) for film in self.films]

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.regular import read_bytes
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.error_log import one_line
 
 MOST_BYTES = 1 << 28  # A larger one would fill the memory of browser and viewer.
 MOST_LETTERS = 60
@@ -27,7 +27,7 @@ class ExportPanel:
         gui, harmless = session.client.gui, session.queue.errors.harmless
         with gui.add_folder("Exports", expand_by_default=False):
             for file in files:
-                label = f"{one_line(file.name, MOST_LETTERS)} ({file.stat().st_size / 1e6:.2g} MB)"
+                label = f"{for_terminal(file.name, MOST_LETTERS)} ({file.stat().st_size / 1e6:.2g} MB)"
                 button = gui.add_button(label, hint="Download")
                 button.on_click(harmless(self._sender(file)))
 

@@ -65,15 +65,15 @@ def guarded_server(auth: Auth, host: str, port: int) -> ViserServer:
 def _answer(
     auth: Auth, viser: Callable[..., Response | None], connection: ServerConnection, request: Request
 ) -> Response | None:
-    port = connection.local_address[1]
-    reason = auth.refusal(request.path, request.headers.get_all, port)
-    if reason is not None:
-        response: Response | None = connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
-    else:
-        response = viser(connection, request)
+    port, host = connection.local_address[1], ""
+    refusal = auth.refusal(request.path, request.headers.get_all, port)
+    try:
+        response = connection.respond(refusal[0], f"{refusal[1]}\n") if refusal else viser(connection, request)
+    except (OSError, ValueError, LookupError):  # a path that no file system takes, or a header that comes twice
+        response = connection.respond(HTTPStatus.BAD_REQUEST, "This is not a request for a page.\n")
     if response is not None:
-        headers = HEADERS | {"Content-Security-Policy": POLICY.format(host=request.headers.get("Host", ""))}
-        if reason is None:
-            headers["Set-Cookie"] = auth.cookie(port)
-        response.headers.update(headers)
+        if refusal is None:
+            host = request.headers["Host"]
+            response.headers["Set-Cookie"] = f"{auth.cookie(port)}; HttpOnly; SameSite=Strict; Path=/"
+        response.headers.update(HEADERS | {"Content-Security-Policy": POLICY.format(host=host)})
     return response

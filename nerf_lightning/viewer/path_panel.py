@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import as_code
 from nerf_lightning.viewer.camera_state import fov_held_by
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.error_log import as_plain_markdown
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.recorded_path import USUAL_SECONDS, RecordedPath, keyframe_of, told
 
@@ -63,7 +63,7 @@ class PathPanel:
                 try:
                     act()
                 except (InputError, OSError) as error:
-                    self.said.content = as_plain_markdown(told(error))
+                    self.said.content = as_code(told(error))
 
         return self.session.queue.errors.harmless(careful)
 
@@ -128,7 +128,7 @@ class PathPanel:
                 self.frusta.hide(False)
 
     def _save(self) -> None:
-        command = as_plain_markdown(f"path=keyframes path.file={self.path.save()}")
+        command = as_code(f"path=keyframes path.file={self.path.save()}")
         self._list_files()
         self.said.content = f"Saved. To film it, add to nerf render: {command}"
 

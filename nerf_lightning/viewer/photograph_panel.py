@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from nerf_lightning.messages.escaping import as_code, for_terminal
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.error_log import as_plain_markdown, one_line
 from nerf_lightning.viewer.frusta import Frusta
 
 NONE = "none"
@@ -17,7 +17,7 @@ class PhotographPanel:
         self.session, self.frusta = session, frusta
         self.names = session.photographs.record.view_names
         gui, harmless = session.client.gui, session.queue.errors.harmless
-        labels = (f"{view}: {one_line(name, MOST_LETTERS)}" for view, name in enumerate(self.names))
+        labels = (f"{view}: {for_terminal(name, MOST_LETTERS)}" for view, name in enumerate(self.names))
         with gui.add_folder("Photographs", expand_by_default=False):
             visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
             self.choice = gui.add_dropdown("Look through", (NONE, *labels), initial_value=NONE)
@@ -36,7 +36,7 @@ class PhotographPanel:
     def enter(self, view: int) -> None:
         """Look through the camera of a view."""
         there = self.session.photographs.has(view)
-        self.name.content = f"Through the camera of {as_plain_markdown(self.names[view])}" + (
+        self.name.content = f"Through the camera of {as_code(self.names[view])}" + (
             "" if there else " (its photograph is not available)"
         )
         self.choice.value = self.choice.options[view + 1]

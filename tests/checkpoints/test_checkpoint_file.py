@@ -6,7 +6,8 @@ import pytest
 import torch
 from support.running import start_code
 
-from nerf_lightning.checkpoints.writing import sweep_leftovers, write_checkpoint
+from nerf_lightning.checkpoints.writing import write_checkpoint
+from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError
 
 
@@ -85,11 +86,13 @@ def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
         write_checkpoint({"a": 1}, tmp_path / "other" / "checkpoints" / "last.ckpt")
 
 
-def test_what_a_killed_process_left_is_swept(tmp_path):
-    (tmp_path / ".last.ckpt.123.tmp").write_text("half")
-    (tmp_path / "last.ckpt").write_text("whole")
-    sweep_leftovers(tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+def test_what_a_killed_process_left_is_swept_and_a_persons_file_stays(tmp_path):
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    for name in (f".last.999999999_{MACHINE}.nerf_lightning.part.ckpt", ".mine.ckpt.123.tmp"):
+        (folder / name).write_text("half")
+    write_checkpoint({"a": 1}, folder / "last.ckpt")
+    assert {file.name for file in folder.iterdir()} == {"last.ckpt", ".mine.ckpt.123.tmp"}
 
 
 def test_a_run_folder_that_is_gone_does_not_come_back(tmp_path):

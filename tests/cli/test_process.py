@@ -1,5 +1,6 @@
 """A process of `nerf` ends as any does, but for the time that Python takes to tear down what it has loaded."""
 
+import os
 import subprocess
 import sys
 
@@ -37,6 +38,22 @@ def test_threads_and_what_is_registered_for_the_end_come_first():
         "    print('block')"
     )
     assert (done.returncode, done.stdout.split()) == (0, ["block", "thread", "registered"])
+
+
+def test_names_that_the_encoding_of_a_pipe_lacks_are_written_as_in_python():
+    code = """
+import subprocess, sys
+from nerf_lightning.cli.process import write_any_name
+from nerf_lightning.messages.console import StdoutConsole, say
+
+write_any_name()
+say("\u65b0.png")
+StdoutConsole().print("\u65b0.png")
+subprocess.run([sys.executable, "-c", "print('\u65b0.png')"], check=True)
+"""
+    env = os.environ | {"PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, env=env)
+    assert done.stdout.split() == [b"\\u65b0.png"] * 3, done.stderr.decode()
 
 
 @pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])

@@ -1,6 +1,7 @@
 """Folders of runs and sweeps from strangers: what they would repeat, and where their links would make us write."""
 
 import json
+import os
 import sys
 
 import pytest
@@ -12,14 +13,16 @@ from support.running import FAST, said
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.files.folders import conf_folder
-from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep, to_give_again
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.runs.sweep import Sweep
-from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord, sweep_record
+from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
 
+JOB = "${hydra.job.num}_seed=${seed}"
+OWN = f"hydra.sweep.subdir='${{file_name:\"{JOB}\"}}'"
 links = pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
 
 
@@ -159,7 +162,7 @@ IN_SWEEPS = [
     "-cd",
     "model=choice(nerf_tiny,'/tmp/evil')",
     # Places.
-    "hydra.sweep.subdir=../../elsewhere",
+    "++hydra.sweep.subdir=../../elsewhere",
     "hydra.job.env_set.PATH=/tmp/evil",
     "hydra.launcher.n_jobs=${oc.env:HOME}",
     # What jobs would get of the values.
@@ -187,7 +190,7 @@ def test_a_planted_override_is_not_repeated(run, kind, line):
         *(("run", x) for x in ("++paths.root_dir=/x", "resume=auto", "+init_from=/x.ckpt", "paths={root_dir:/x}")),
         *(("run", x) for x in ("viewer@callbacks=on", "viewer={live_view:{host:0.0.0.0}}")),
         *(("sweep", x) for x in ("paths.root_dir=/x", "++resume=/x", "sweep.resume=true", "++sweep.evil=1")),
-        *(("sweep", x) for x in ("hydra.mode=MULTIRUN", f"hydra.sweep.subdir='{JOB_NUMBER}/../../evil'")),
+        *(("sweep", x) for x in ("hydra.mode=MULTIRUN", "hydra.sweep.subdir=../../evil")),
     ],
 )
 def test_what_belongs_to_one_start_is_left_out(run, kind, line):
@@ -200,16 +203,24 @@ def test_values_that_are_paths_name_no_folders(tmp_path):
     """A job in DIR/0_scene.root=../../../elsewhere would write there."""
     leave("sweep", tmp_path, "scene.root=../../../elsewhere,b", "seed=0,1")
     asked = sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"])
-    assert asked[-1] == f"hydra.sweep.subdir='{JOB_NUMBER}_seed=${{seed}}'"
+    assert asked[-1] == OWN
+
+
+def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
+    planted = ("scene=llff", "scene.root=absent", "scene.name=a,b", "scene.name=../../../ESCAPED")
+    leave("sweep", tmp_path / "x" / "sweep", *planted)
+    result = nerf("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}/x/sweep")
+    assert "1 of 1 jobs failed. 0_scene.name=.._.._.._ESCAPED: The folder absent does not exist" in result.err
+    assert "Traceback" not in result.err
 
 
 def test_what_the_user_types_again_is_the_users(run):
     leave("run", run, "scene.cache_dir=/x", "seed=1")
     assert repeated("run", run, f"resume={run}", "scene.cache_dir=/y") == ["seed=1"]
     leave("sweep", run, "hydra.sweep.subdir=mine", "scene.cache_dir=/x", "seed=0,1")
-    again = ["hydra.sweep.subdir=ours", "scene.cache_dir=/y"]
+    again = ["hydra.sweep.subdir='ours/${seed}'", "scene.cache_dir=/y"]
     assert sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={run}", *again]) == [
-        "-m", "seed=0,1", "sweep.resume=true", f"hydra.sweep.dir={run}", *again
+        "-m", "seed=0,1", "sweep.resume=true", f"hydra.sweep.dir={run}", again[1], OWN.replace(JOB, "ours/${seed}")
     ]  # fmt: skip
 
 
@@ -325,6 +336,15 @@ def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
         with pytest.raises(InputError, match="symbolic link"):
             open_run(composed("train", f"paths.output_dir={tmp_path}/here", f"resume={resume}"), 100, None)
     assert (tmp_path / "victim").read_text() == "precious"
+
+
+@pytest.mark.parametrize("key", ["output_dir", "root_dir"])
+def test_a_run_folder_that_no_event_file_can_lie_in_is_refused(tmp_path, key):
+    """TensorBoard's writer encodes the path as UTF-8."""
+    place = tmp_path / os.fsdecode(b"x\xff")
+    with pytest.raises(InputError, match=r"The run folder .* has a name that is not UTF-8 or holds control"):
+        open_run(OmegaConf.merge(composed("train"), {"paths": {key: str(place)}}), 100, None)
+    assert not place.exists()
 
 
 def test_more_overrides_than_agreed_are_not_read(run):

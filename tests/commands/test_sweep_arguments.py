@@ -8,7 +8,7 @@ from support.running import start_code
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord
+from nerf_lightning.runs.sweep_record import SweepRecord
 
 
 def leave_sweep(folder, *arguments, slurm_job=None):
@@ -21,13 +21,13 @@ def test_the_flag_comes_first_wherever_it_was_typed_and_a_single_run_stays_as_it
 
 
 def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):
-    subdir = f"hydra.sweep.subdir='{JOB_NUMBER}_seed=${{seed}}'"
+    subdir = "hydra.sweep.subdir='${file_name:\"${hydra.job.num}_seed=${seed}\"}'"
     made = ("hydra.mode=MULTIRUN", "hydra.sweep.dir=x", subdir, "sweep.resume=true")
     leave_sweep(tmp_path / "my sweep", *made, "hydra/launcher=parallel", "seed=0,1", "model=nerf_tiny")
     asked = ["-m", "sweep.resume=true", f"paths.output_dir='{tmp_path}/my sweep'", "model=nerf"]
     assert sweep_arguments(asked) == [
         "-m", "hydra/launcher=parallel", "seed=0,1", "sweep.resume=true", f"hydra.sweep.dir='{tmp_path}/my sweep'",
-        "model=nerf", "hydra.sweep.subdir='${hydra.job.num}_seed=${seed}'",
+        "model=nerf", subdir,
     ]  # fmt: skip
 
 

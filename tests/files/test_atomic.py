@@ -1,6 +1,7 @@
 """Files that are whole or not there, and what processes that were killed leave of them."""
 
 import errno
+import os
 import sys
 
 import pytest
@@ -9,6 +10,7 @@ from support.running import start_code
 from nerf_lightning.files import atomic
 from nerf_lightning.files.atomic import NO_ROOM, full_disk_named, whole_file
 
+LEFT = f".a.999999999_{atomic.MACHINE}.nerf_lightning.part.txt"  # of no process
 KILLED = """
 import os, signal, sys
 from pathlib import Path
@@ -63,13 +65,36 @@ def test_a_file_that_is_made_and_not_yet_locked_is_not_lost(tmp_path, monkeypatc
 
 
 def test_what_a_person_has_beside_it_stays(tmp_path):
-    kept = (".notes.part.txt", "a.12.part.txt", ".profile", ".12.party")
+    kept = (".notes.part.txt", "a.12.part.txt", ".profile", ".12.party", ".holiday.2024.part.zip", ".backup.001.part")
+    kept += (".thesis.3.part.docx", ".a.12.nerf_lightning.part.txt", ".nerf_lightning.part")
     for name in kept:
         (tmp_path / name).write_text("mine")
-    (tmp_path / ".a.12.part").mkdir()
+    (tmp_path / LEFT).mkdir()
     with whole_file(tmp_path / "a.txt") as part:
         part.write_text("whole")
-    assert {file.name for file in tmp_path.iterdir()} == {*kept, ".a.12.part", "a.txt"}
+    assert {file.name for file in tmp_path.iterdir()} == {*kept, LEFT, "a.txt"}
+
+
+@pytest.mark.skipif(atomic.fcntl is None, reason="the system has no locks")
+@pytest.mark.parametrize("error", [None, errno.ENOLCK, errno.EWOULDBLOCK])
+def test_without_locks_the_process_tells_whether_a_writer_lives(tmp_path, monkeypatch, error):
+    """None: a system without them; ENOLCK: a file system; EWOULDBLOCK: there are, and somebody holds it."""
+
+    def no_lock(file, operation):
+        raise OSError(error, "no lock")
+
+    other_machine = LEFT.replace(atomic.MACHINE, "0" * 8)
+    alive = LEFT.replace("999999999", str(os.getppid()))
+    for name in (LEFT, other_machine, alive):
+        (tmp_path / name).write_text("half")
+    if error is None:
+        monkeypatch.setattr(atomic, "fcntl", None)
+    else:
+        monkeypatch.setattr(atomic.fcntl, "flock", no_lock)
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    left = {LEFT} if error == errno.EWOULDBLOCK else set()
+    assert {file.name for file in tmp_path.iterdir()} == {"a.txt", other_machine, alive} | left
 
 
 def test_a_failed_block_leaves_what_was_there_and_a_full_disk_is_said_of_its_file(tmp_path):

@@ -11,10 +11,9 @@ from nerf_lightning.files.made_folders import (
     LOCK,
     MARK,
     ScratchFolder,
-    below,
+    child_of,
     empty_ours,
     make_folder,
-    make_new_folder,
     make_ours,
     remove_empty,
 )
@@ -26,10 +25,8 @@ OF_OS = {"remove"}  # lists have one, too
 ALLOWED = {
     "files/made_folders.py": {"mkdir", "rmdir", "rmtree", "unlink"},
     "files/atomic.py": {"unlink"},  # of temporary files that nobody holds, and its own
-    "files/private.py": {"mkdir"},  # of caches, for the user alone
     "nerf/kernels/backends.py": {"makedirs"},  # the same; this part imports nothing of the program
-    "data/bricks/cache.py": {"unlink"},  # of a part in such a cache
-    "data/pixels/mapped_store.py": {"unlink"},
+    "data/pixels/mapped_store.py": {"unlink"},  # of a header in a cache, before its pixels are replaced
     "checkpoints/writing.py": {"mkdir", "unlink"},  # no run folder that is gone; of a checkpoint in its own folder
     "runs/sweep.py": {"unlink"},  # of records of jobs, by their names
     "viewer/recorded_path.py": {"unlink"},  # of a file that it has just made
@@ -66,7 +63,7 @@ def test_below_a_named_folder_nothing_is_reached_through_a_link(tmp_path):
     (tmp_path / "disk" / "a" / "link").symlink_to("b")
     (tmp_path / "disk" / "nowhere").symlink_to("nothing")
     for names in (("a", "link"), ("a", "link", "c"), ("nowhere",)):
-        for call in (below, make_folder, make_ours):
+        for call in (child_of, make_folder, make_ours):
             refused(call, tmp_path / "named", *names, parts=("is a symbolic link to", "Remove the link"))
     assert [path.name for path in (tmp_path / "disk" / "a").iterdir()] in (["b", "link"], ["link", "b"])
     assert list((tmp_path / "disk" / "a" / "b").iterdir()) == []
@@ -108,7 +105,7 @@ def test_a_scratch_folder_is_held_by_one_and_vanishes(tmp_path):
     one.hold()
     (one.path / "half").touch()
     refused(other.hold, parts=(f"{tmp_path}/out is in use by another process that works there",))
-    one.release()
+    one.lock.release()
     other.hold()
     assert (other.path / "half").exists()
     other.remove()
@@ -118,8 +115,8 @@ def test_a_scratch_folder_is_held_by_one_and_vanishes(tmp_path):
 def test_a_new_folder_is_nobody_elses_and_only_empty_ones_are_removed(tmp_path):
     (tmp_path / "theirs").mkdir()
     with pytest.raises(FileExistsError):
-        make_new_folder(tmp_path / "theirs")
-    make_new_folder(tmp_path / "a" / "new")
+        make_folder(tmp_path, "theirs", new=True)
+    make_folder(tmp_path, "a", "new", new=True)
     (tmp_path / "theirs" / "file").touch()
     remove_empty(tmp_path / "none", tmp_path / "theirs", tmp_path / "a" / "new", tmp_path / "a")
     assert [path.name for path in tmp_path.iterdir()] == ["theirs"]

@@ -11,7 +11,8 @@ from support.malformed import WRITERS
 from support.posed_captures import read
 
 from nerf_lightning.data.bricks.reader import BricksReader
-from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.files.made_folders import make_own_folder
+from nerf_lightning.files.regular import open_own
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels import backends
 

@@ -6,7 +6,7 @@ import socket
 import pytest
 from support.waiting import fifo, within
 
-from nerf_lightning.files.regular import open_regular, open_to_append, read_bytes, read_text
+from nerf_lightning.files.regular import contents, open_regular, open_to_append, read_bytes, read_text
 from nerf_lightning.messages.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs, sockets and devices are posix's")
@@ -98,5 +98,20 @@ def test_what_is_no_text_is_named(tmp_path):
 
 @pytest.mark.parametrize("name", ["absent", "nul\0", "x" * 300, "folder/it"])
 def test_what_cannot_be_opened_is_named(tmp_path, name):
-    with pytest.raises(InputError, match=r"cannot be read: .*\. Mend it\."):
+    with pytest.raises(InputError, match=r"does not exist; the folder holds nothing.* Put the file there, or give"):
         read_bytes(tmp_path / name, 10, "Mend it.")
+
+
+def test_a_folder_is_described_with_what_is_no_file_in_it(tmp_path):
+    fifo(tmp_path / "transforms.json")
+    device(tmp_path / "b")
+    (tmp_path / "c").symlink_to("nowhere")
+    (tmp_path / "d").symlink_to("d")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "poses.npy").touch()
+    assert contents(tmp_path) == (
+        "b (a device), c (a symbolic link to nowhere, which leads nowhere), "
+        "d (a symbolic link to d, which leads nowhere), images, poses.npy, transforms.json (a named pipe (FIFO))"
+    )
+    with pytest.raises(InputError, match=r"c is a symbolic link to nowhere, which leads nowhere. Put"):
+        read_bytes(tmp_path / "c", 10)

@@ -43,7 +43,7 @@ OTHERWISE = {
     "video/film.py": ["open"],
     "evaluation/metrics_files.py": ["open"],
     "runs/table_files.py": ["open"],
-    "data/bricks/cache.py": ["load", "open", "open"],
+    "data/bricks/cache.py": ["load"],
     "data/bricks/parts.py": ["read_text"],
     "data/pixels/images.py": ["open"],
     "files/numpy_files.py": ["load"],

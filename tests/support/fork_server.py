@@ -322,9 +322,11 @@ def become(request: dict[str, Any]) -> None:
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
-    if os.environ.get(UNBUFFERED):
-        raw = open(1, "wb", buffering=0, closefd=False)  # noqa: SIM115 - as long as the process
-        sys.stdout = sys.__stdout__ = io.TextIOWrapper(raw, write_through=True)
+    # The server's own streams led elsewhere when they were made.
+    raw = bool(os.environ.get(UNBUFFERED))
+    out, err = open(1, "wb", 0 if raw else -1, closefd=False), open(2, "wb", closefd=False)  # noqa: SIM115
+    sys.stdout = sys.__stdout__ = io.TextIOWrapper(out, write_through=raw)
+    sys.stderr = sys.__stderr__ = io.TextIOWrapper(err, errors="backslashreplace", line_buffering=True)
     sys.path[0] = os.getcwd()
     # Python's own generator is seeded anew by os.fork.
     sys.modules["numpy"].random.seed()

@@ -1,5 +1,7 @@
 """Who may speak to the page: its own browser tabs and whoever has the token; nobody else, and no other site."""
 
+import socket
+
 import pytest
 from support.served_page import served
 from support.viser_client import ViserClient
@@ -51,6 +53,24 @@ def test_another_host_is_refused_although_it_has_the_token(page):
     assert "viewer.hosts=[evil.example]" in refused(lambda: page.as_host(f"evil.example:{page.port}"))
     assert page.get(f"/?token={page.token}", Host=f"evil.example:{page.port}")[0] == 403
     assert page.get(f"/?token={page.token}", Host="127.0.0.1, evil.example")[0] == 403
+
+
+REQUESTS = [
+    ("/", ["Host: localhost", "Host: localhost"], 400),
+    ("/", [], 400),
+    ("/", ["Host: localhost", "Accept-Encoding: gzip", "Accept-Encoding: br"], 400),
+    ("/" + "a" * 7000, ["Host: localhost"], 414),
+    ("/" + "a" * 300, ["Host: localhost"], 400),
+    ("/%00", ["Host: localhost"], 404),
+]
+
+
+@pytest.mark.parametrize(("path", "headers", "status"), REQUESTS)
+def test_requests_that_are_none_are_refused_and_not_taken_for_errors_of_the_page(page, path, headers, status):
+    with socket.create_connection(("127.0.0.1", page.port), timeout=20) as line:
+        lines = [f"GET {path}?token={page.token} HTTP/1.1", *headers, "Connection: close", "", ""]
+        line.sendall("\r\n".join(lines).encode())
+        assert line.makefile("rb").readline().split()[1] == str(status).encode()
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=none", "?token=%ff", "?else=1"])

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-import os
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -15,7 +14,9 @@ from filelock import FileLock
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import make_own_folder
+from nerf_lightning.files.regular import open_own
 from nerf_lightning.messages.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -73,16 +74,9 @@ def _load(path: Path, pixels: int) -> Rendered | None:
 
 
 def _save(path: Path, rendered: Rendered) -> Rendered:
-    # A reader must never see half a file: write beside it, then swap names.
-    part = path.with_suffix(".part")
     try:
-        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
-        part.unlink(missing_ok=True)
-        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as stream:
-            np.savez(stream, **vars(rendered))
-        os.replace(part, path)
+        with whole_file(path, mode=0o600) as part:
+            np.savez(part, **vars(rendered))
     except OSError as error:
         logger.warning("Cannot keep the bricks scene in %s (%s).", path.parent, error)
-    finally:
-        part.unlink(missing_ok=True)
     return rendered

@@ -3,7 +3,6 @@
 import logging
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import get_args
 
 import torch
@@ -162,14 +161,6 @@ def _with_known_depths(capture: Capture) -> Capture:
         *(capture.source, len(bad), len(near), listed((capture.views[number].name for number in bad), 3)),
     )
     return replace(capture, bounds=None)
-
-
-def contents(folder: Path) -> str:
-    """Return what a folder holds, in a few words."""
-    try:
-        return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
-    except OSError as error:  # it is not there either
-        return f"nothing that can be read ({error.strerror})"
 
 
 def check_step(name: str, value: object) -> None:

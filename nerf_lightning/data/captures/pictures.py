@@ -11,13 +11,12 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 from urllib.parse import unquote
 
 from nerf_lightning.data.pixels.formats import HEIC_ENDINGS, UNREAD, decoders
 from nerf_lightning.data.pixels.images import ENDINGS
-from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -162,7 +161,16 @@ def named_picture(
         for path in candidates
         if inside is None or any(Path(os.path.abspath(path)).is_relative_to(each) for each in inside)
     )
-    return next((path for path in allowed if path not in taken and is_there(path)), None)
+    return next((path for path in allowed if path not in taken and os.path.isfile(path)), None)
+
+
+def is_absolute(name: str) -> bool:
+    r"""Return whether a name begins at a root, of Windows too.
+
+    >>> is_absolute("/home/a.jpg"), is_absolute(r"C:\a.jpg"), is_absolute("images/a.jpg")
+    (True, True, False)
+    """
+    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
 
 
 def _parts(name: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, contents, usable
+from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
@@ -23,6 +23,7 @@ from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscal
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
+from nerf_lightning.files.regular import contents, what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
@@ -170,8 +171,12 @@ class CaptureReader(Reader):
         if os.path.isfile(folder):
             return folder.parent
         if not os.path.isdir(folder):
-            where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
-            raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
+            where = (
+                ""
+                if folder.is_absolute() or os.path.lexists(folder)
+                else f" in {Path.cwd()}, where relative ones are looked for"
+            )
+            raise InputError(f"The folder {folder} {what_is(folder)}{where}. Set scene.root to the capture's folder.")
         return folder
 
     def _with_masks(self, capture: Capture) -> Capture:

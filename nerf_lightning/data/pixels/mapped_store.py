@@ -7,7 +7,6 @@ says what the other file is: without it, or where the two disagree, nothing is b
 import json
 import logging
 import mmap
-import os
 import platform
 import shutil
 import sys
@@ -23,7 +22,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from nerf_lightning.data.pixels.store import layout
-from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import make_own_folder
+from nerf_lightning.files.regular import AbsentError, open_own
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
 
@@ -120,22 +121,13 @@ def check_room(folder: Path, num_bytes: int) -> None:
 
 
 def _make(base: Path, make: Callable[[Path], Header]) -> Header:
-    """Write the pixels under another name, and the header once they have theirs."""
-    part, note = base.with_suffix(".part"), base.with_suffix(".json.part")
-    try:
-        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
-        part.unlink(missing_ok=True)
-        note.unlink(missing_ok=True)
+    """Write the pixels, and the header once they have their name."""
+    path, about = base.with_suffix(".pixels"), base.with_suffix(".json")
+    with whole_file(about, mode=0o600) as note, whole_file(path, mode=0o600) as part:
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part), "checksum": _checksum(part)}))
-        note.touch(mode=0o600)
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
-        base.with_suffix(".json").unlink(missing_ok=True)
-        os.replace(part, base.with_suffix(".pixels"))
-        os.replace(note, base.with_suffix(".json"))
-    finally:
-        part.unlink(missing_ok=True)
-        note.unlink(missing_ok=True)
+        about.unlink(missing_ok=True)
     log.info("Cached %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
     return header
 
@@ -150,7 +142,7 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
         if sound and (contents is not None or header.num_bytes <= CHECKED_WHOLE):
             sound = header.checksum == _checksum(path)
-    except FileNotFoundError:
+    except AbsentError:
         return None
     except (OSError, ValueError, TypeError, KeyError, RecursionError, InputError) as error:
         log.warning("%s is not used (%s); the photographs are read again.", base, error)

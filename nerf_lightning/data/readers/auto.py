@@ -12,7 +12,6 @@ from typing import Any
 import yaml
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.reader import CaptureReader, located, require_one
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
@@ -20,6 +19,7 @@ from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.folders import conf_file, option_names
+from nerf_lightning.files.regular import contents
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene

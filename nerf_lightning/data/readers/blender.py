@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
-from nerf_lightning.data.captures.checks import check_step, contents, usable
+from nerf_lightning.data.captures.checks import check_step, usable
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import cameras_of, decoded, require_fit
@@ -22,6 +22,7 @@ from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import GivenFrameReader
 from nerf_lightning.data.readers.frames import FrameFile, say_of_files, views_of
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -130,14 +131,10 @@ class BlenderReader(GivenFrameReader):
         root = Path(self.root).expanduser()
         root = root.parent if os.path.isfile(root) else root
         if not os.path.isdir(root):
-            raise InputError(f"The folder {root} does not exist. Set scene.root to the capture's folder.")
-        files = {split: _file_of(root, split) for split in SPLITS}
-        if files["train"] is None:
-            raise InputError(
-                f"{root / 'transforms_train.json'} does not exist; the folder holds {contents(root)}. "
-                "Set scene.root to the folder that holds transforms_train.json."
-            )
-        read = {split: FrameFile.read(path, FORMAT) for split, path in files.items() if path is not None}
+            raise InputError(f"The folder {root} {what_is(root)}. Set scene.root to the capture's folder.")
+        files = {split: path for split in SPLITS if (path := _file_of(root, split))}
+        files.setdefault("train", root / "transforms_train.json")  # whoever opens it says what is wrong
+        read = {split: FrameFile.read(path, FORMAT) for split, path in files.items()}
         say_of_files(list(read.values()))
         left_out = LeftOut(str(files["train"]))
         views: dict[str, list[View]] = {split: [] for split in SPLITS}

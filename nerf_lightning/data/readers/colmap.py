@@ -16,7 +16,13 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, named_picture, pictures_below
+from nerf_lightning.data.captures.pictures import (
+    PICTURE_FOLDERS,
+    find_pictures,
+    is_absolute,
+    named_picture,
+    pictures_below,
+)
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.colmap_files import (
@@ -28,7 +34,7 @@ from nerf_lightning.data.readers.colmap_files import (
     TextFiles,
 )
 from nerf_lightning.data.readers.ply_points import read_ply_points
-from nerf_lightning.files.links import is_absolute
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -102,7 +108,7 @@ class ColmapReader(CaptureReader):
         names, left_out = [image.name for image in model.images], LeftOut(str(folder))
         where = root if self.images is None else root / self.images
         if not os.path.isdir(where):
-            raise InputError(f"{where} does not exist. Set scene.images to the photographs' folder below {root}.")
+            raise InputError(f"{where} {what_is(where)}. Set scene.images to the photographs' folder below {root}.")
         usual = [where] if self.images else [root / name for name in (*_beside(folder, root), *PICTURE_FOLDERS)]
         pictures = next((place for place in usual if os.path.isdir(place)), where)
         files = find_pictures(names, pictures, where, folder, self.allow_outside)
@@ -236,7 +242,7 @@ def models_in(root: Path) -> list[Path]:
     for place in MODEL_FOLDERS:
         folder = root / place
         below = sorted(path for path in folder.iterdir() if path.is_dir()) if place and folder.is_dir() else []
-        found = [path for path in (*below, folder) if any((path / f"cameras{e}").is_file() for e in KINDS)]
+        found = [path for path in (*below, folder) if any(os.path.lexists(path / f"cameras{e}") for e in KINDS)]
         found = [path for path in found if path not in models]
         models += sorted(found, key=_number_of_images, reverse=True) if len(found) > 1 else found
     return models

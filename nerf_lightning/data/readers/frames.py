@@ -14,12 +14,11 @@ from typing import Any
 from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures, named_picture
+from nerf_lightning.data.captures.pictures import find_pictures, is_absolute, named_picture
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
-from nerf_lightning.files.links import is_absolute
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov

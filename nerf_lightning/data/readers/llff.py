@@ -12,7 +12,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, numeric_order, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
@@ -124,11 +123,6 @@ def _registered(root: Path, names: list[str]) -> list[str]:
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
     """Return a row for each view: a 3 x 5 matrix (down, right, back, center; height, width, focal) and two depths."""
-    if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; the folder holds {contents(path.parent)}. "
-            "Point scene.root at the folder that has it."
-        )
     # Read by its own format: np.load would open archives too, and unpickle what is neither.
     with reading(path, CURE), open_regular(path, MOST_BYTES, CURE) as file:
         rows = np.lib.format.read_array(file, allow_pickle=False)

@@ -19,7 +19,6 @@ from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import GivenFrameReader
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
-from nerf_lightning.files.links import is_there
 from nerf_lightning.files.numpy_files import open_archive
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.files.trust import reading
@@ -107,8 +106,6 @@ class NpzReader(GivenFrameReader):
 
 def _load(path: Path, max_gigabytes: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Return images, poses and the focal length; nothing in the file is executed (no pickles)."""
-    if not is_there(path):
-        raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
     with (
         reading(path, CURE),
         open_regular(path, None) as file,

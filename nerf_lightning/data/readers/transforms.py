@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
-from nerf_lightning.data.captures.checks import contents, pose_from_matrix
+from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
@@ -25,7 +25,6 @@ from nerf_lightning.data.readers.frames import (
     views_of,
 )
 from nerf_lightning.data.readers.ply_points import read_ply_points
-from nerf_lightning.files.links import is_there
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import unit_of
@@ -86,17 +85,12 @@ class TransformsReader(CaptureReader):
 
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()
-        if self.file is not None or os.path.isfile(root):
-            path = root
-            if self.file is not None:  # it may lie in a folder that is a capture itself
-                places = [folder / self.file for folder in (self.named_folder(), self.folder())]
-                path = next(filter(is_there, places), places[0])
-            if not is_there(path):
-                raise InputError(_absent(path))
-            return [path]
-        paths = _files_in(self.folder())
-        if not paths:
-            raise InputError(_absent(self.folder() / "transforms.json"))
+        if self.file is not None:  # it may lie in a folder that is a capture itself
+            places = [folder / self.file for folder in (self.named_folder(), self.folder())]
+            return [next(filter(os.path.isfile, places), places[0])]
+        if os.path.isfile(root):
+            return [root]
+        paths = _files_in(self.folder()) or [self.folder() / "transforms.json"]
         if len(paths) > 1:
             log.info("%s: read as one capture: %s", self.folder(), listed((path.name for path in paths), 5))
         return paths
@@ -141,20 +135,15 @@ class TransformsReader(CaptureReader):
 def _files_in(folder: Path) -> list[Path]:
     """Return transforms.json, or else all files that are one capture: of the splits, or of parts."""
     for name in ("transforms.json", "transform.json"):
-        if is_there(folder / name):
+        if os.path.isfile(folder / name):
             return [folder / name]
-    found = [path for path in sorted(folder.glob("transform*_*.json")) if is_there(path)]
+    found = [path for path in sorted(folder.glob("transform*_*.json")) if os.path.isfile(path)]
     order = {name: number for number, name in enumerate(SPLITS)}
     return sorted(found, key=lambda path: (order.get(_split_of(path), len(order)), path.name))
 
 
 def _split_of(path: Path) -> str:
     return path.stem.rpartition("_")[2]
-
-
-def _absent(path: Path) -> str:
-    held = contents(path.parent)
-    return f"{path} does not exist; the folder holds {held}. Point scene.root at the folder with {path.name}."
 
 
 def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, "points 3"]:
@@ -165,9 +154,9 @@ def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, 
         return none
     name = file.content["ply_file_path"]
     path = file.path.parent / path_of(name, "ply_file_path", str(file.path)).replace("\\", "/")
-    if not is_there(path) or not (outside or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root))):
+    if not os.path.isfile(path) or not (outside or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root))):
         path = root / path.name
-    if not is_there(path):
+    if not os.path.isfile(path):
         log.warning("%s: the points of ply_file_path=%s are missing, and are left out", file.path, name)
         return none
     try:

@@ -12,7 +12,7 @@ from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseMode
 from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 from nerf_lightning.files.atomic import full_disk_named
-from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
+from nerf_lightning.files.made_folders import ScratchFolder, child_of, empty_ours, make_folder, remove_empty
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -27,7 +27,7 @@ UNFINISHED = ".poses.part"
 
 def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
     """Refuse to write over poses, or over pictures that are not those of `source`, through links either."""
-    if below(folder, "sparse", "0").exists():
+    if child_of(folder, "sparse", "0").exists():
         raise InputError(
             f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
             "with paths.output_dir=DIR."

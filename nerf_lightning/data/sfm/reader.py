@@ -18,7 +18,7 @@ from nerf_lightning.data.sfm.reconstruction import require_pycolmap
 from nerf_lightning.data.sfm.settings import Panoramas, SfmSettings
 from nerf_lightning.data.sfm.summary import remarks
 from nerf_lightning.files.folders import default_folder
-from nerf_lightning.files.private import make_own_folder
+from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.messages.errors import InputError
 
 log = logging.getLogger(__name__)

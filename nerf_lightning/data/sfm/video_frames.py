@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageFilter
 
 from nerf_lightning.data.sfm.hdr_films import hdr_transfer, tone_mapped
-from nerf_lightning.files.regular import explained, open_regular
+from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
 FRAMES_WANTED = 100
@@ -66,8 +66,6 @@ def count_frames(path: Path) -> int:
     """Return how many frames a video has; refuse what is no video."""
     import imageio_ffmpeg
 
-    if not path.is_file():
-        raise InputError(f"video={path}: there is no such file. Give a video, or a folder of photographs with images=.")
     require_video(path)
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
@@ -153,7 +151,7 @@ SYNC = 0x47
 def require_video(path: Path) -> None:
     """Refuse what is no container of video, and say what is read."""
     # However large: a few frames of it are in memory at a time.
-    with explained(path), open_regular(path, None) as file:
+    with open_regular(path, None) as file:
         start = file.read(600)
     known = start.startswith(STARTS) or start[4:8] in BOXES
     riff = start[:4] == b"RIFF" and start[8:12] == b"AVI "

@@ -15,6 +15,7 @@ from nerf_lightning.export.splats.comparison import compared
 from nerf_lightning.export.splats.files import HALF_TURN, SplatFormat, moved, require_library, save_splats
 from nerf_lightning.export.splats.fitted import SplatFitting
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.nerf.geometry.frames import directions_to_user, y_up
 from nerf_lightning.nerf.models.base import Model
@@ -50,7 +51,7 @@ class SplatsExport(SplatFitting):
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Fit, compare and write."""
-        path, facts, picture = (folder / f"splats.{end}" for end in (self.format, "json", "png"))
+        path, facts, picture = (child_of(folder, f"splats.{end}") for end in (self.format, "json", "png"))
         require_free(files=[path, facts, picture])
         if self.format == "spz":
             require_library()  # before the work, not after it

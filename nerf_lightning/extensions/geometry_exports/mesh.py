@@ -38,6 +38,7 @@ from nerf_lightning.extensions.geometry_exports.texture import (
     make_atlas,
     require_texture_room,
 )
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user, unit_of
@@ -127,7 +128,7 @@ class MeshExport(Export):
         """Write the mesh."""
         refuse_ndc(record, "mesh")
         beside = ("mtl", "png") if self.texture and self.format == "obj" else ()
-        require_free(folder / f"mesh.{ending}" for ending in (self.format, *beside))
+        require_free(child_of(folder, f"mesh.{ending}") for ending in (self.format, *beside))
         require_library("trimesh")  # before the work, not after it
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT[self.surface])
         if self.texture:
@@ -166,7 +167,7 @@ class MeshExport(Export):
         placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
         frame = GltfFrame(up.numpy(), record.metres_per_unit or 1.0)
         save = save_textured_mesh if self.texture else save_mesh
-        return save(folder / f"mesh.{self.format}", placed.numpy(), faces, turned.numpy(), frame=frame, **look)
+        return save(child_of(folder, f"mesh.{self.format}"), placed.numpy(), faces, turned.numpy(), frame=frame, **look)
 
     def _surface(
         self, model: Model, record: SceneRecord, lattice: Lattice, tile_points: int, report: Report

@@ -11,6 +11,7 @@ from numpy import ndarray
 from PIL import Image
 
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.errors import InputError, require_extra
 from nerf_lightning.nerf.geometry.frames import y_up
 from nerf_lightning.nerf.rendering.linear_light import to_linear
@@ -114,7 +115,7 @@ def save_textured_mesh(
         exchange = require_library("trimesh.exchange.obj")
         settings = {"include_normals": True, "return_texture": True, "header": None}
         text, beside = exchange.export_obj(mesh, mtl_name=path.with_suffix(".mtl").name, **settings)
-        contents = {path.with_name(name): content for name, content in beside.items()} | {path: text.encode()}
+        contents = {child_of(path.parent, name): content for name, content in beside.items()} | {path: text.encode()}
     for each, content in contents.items():
         with whole_file(each) as part:
             part.write_bytes(content)

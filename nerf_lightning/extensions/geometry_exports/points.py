@@ -17,6 +17,7 @@ from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.visibility import nearest_views, num_agreeing, see
 from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most
@@ -74,7 +75,7 @@ class PointsExport(Export):
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
-        require_free(files=[folder / f"points.{self.format}"])
+        require_free(files=[child_of(folder, f"points.{self.format}")])
         if self.format == "las":
             require_library("laspy", "las")  # before the work, not after it
         views = evenly_spaced_subset(record.splits["train"], self.max_views)
@@ -110,7 +111,7 @@ class PointsExport(Export):
     def _save(self, cloud: Float[Tensor, "points 9"], record: SceneRecord, folder: Path) -> Path:
         if len(cloud) > self.num_points:
             cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[: self.num_points]]
-        to_user, path = record.to_user.double(), folder / f"points.{self.format}"
+        to_user, path = record.to_user.double(), child_of(folder, f"points.{self.format}")
         points = points_to_user(cloud[:, :3].double(), to_user)
         colors = to_bytes(cloud[:, 6:]).numpy()
         if self.format == "las":

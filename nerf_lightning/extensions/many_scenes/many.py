@@ -12,6 +12,7 @@ from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.extensions.many_scenes.brick_models import BrickModelReader
 from nerf_lightning.extensions.many_scenes.joined import joined
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -95,7 +96,7 @@ class ManyReader(Reader):
 
     def _in_folder(self, root: Path) -> tuple[dict[str, Reader], set[str]]:
         if not os.path.isdir(root):
-            raise InputError(f"The folder {root} does not exist. Set scene.root to a folder of captures.")
+            raise InputError(f"The folder {root} {what_is(root)}. Set scene.root to a folder of captures.")
         found = [each for each in sorted(root.iterdir()) if each.is_dir() and AutoReader.known_format(each)]
         if not found:
             raise InputError(

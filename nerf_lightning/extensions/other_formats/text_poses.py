@@ -94,8 +94,6 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
         name = picture.name
         with left_out.unless_usable(prefix + name):
             pose, own = folder / "pose" / f"{stem}.txt", folder / "intrinsics" / f"{stem}.txt"
-            if not pose.is_file():
-                raise InputError(f"{pose} does not exist, so {name} has no pose.")
             intrinsics = _numbers(own if own.is_file() else folder / "intrinsics.txt")
             header = read_header(picture)
             (fx, fy, cx, cy), size = _intrinsics(intrinsics, header.size)

@@ -16,6 +16,8 @@ from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cam
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 from nerf_lightning.data.bricks.tracer import SIDES, Pinhole, Tracer
+from nerf_lightning.files import atomic
+from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, project, rays_through_pixels
@@ -286,7 +288,8 @@ def test_what_a_killed_process_left_in_the_cache_is_replaced(tmp_path: Path) -> 
     small.read()
     (path,) = tmp_path.glob("*.npz")
     sound = path.read_bytes()
-    path.rename(path.with_suffix(".part"))  # killed just before the renaming
+    path.rename(path.with_name(f".{path.stem}.999999999_{MACHINE}.nerf_lightning.part.npz"))  # killed before that
+    atomic._sweep.cache_clear()
     small.read()
     assert path.read_bytes() == sound
     assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".lock"}

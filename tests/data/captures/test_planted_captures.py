@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import struct
 import sys
@@ -22,6 +23,7 @@ from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.data.sfm.video_frames import count_frames
+from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError
 
 MEGABYTE = 2**20
@@ -344,8 +346,9 @@ def test_a_cache_of_other_photographs_is_refused(tmp_path, header):
 def test_links_in_the_place_of_a_lock_or_of_parts_are_not_followed(tmp_path, header):
     header.unlink()
     (tmp_path / "victim").write_text("precious")
-    for ending in (".part", ".json.part"):
-        header.with_suffix(ending).symlink_to(tmp_path / "victim")
+    for ending in (".pixels", ".json"):
+        part = f".{header.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{ending}"
+        header.with_name(part).symlink_to(tmp_path / "victim")
     assert len(read("colmap", tmp_path / "capture").view_names) == 9
     header.unlink()
     header.with_suffix(".lock").unlink(missing_ok=True)

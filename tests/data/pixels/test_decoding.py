@@ -16,6 +16,8 @@ from nerf_lightning.data.pixels import decoding as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
 from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
 from nerf_lightning.data.pixels.images import PictureHeader, area_downscale, crop_to_multiple, read_rgba
+from nerf_lightning.files import atomic
+from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError
 
 SIZES = [(9, 7), (8, 8), (6, 10)]
@@ -209,9 +211,10 @@ def test_a_failed_reader_leaves_nothing_and_a_killed_one_nothing_that_is_believe
     capture[0].path.write_bytes(sound)
     store = read(capture, cache)
     (path,) = cache.glob("*.pixels")
-    path.rename(path.with_suffix(".part"))  # killed just before the renaming
+    path.rename(path.with_name(f".{path.stem}.999999999_{MACHINE}.nerf_lightning.part.pixels"))  # killed before that
+    atomic._sweep.cache_clear()
     assert np.array_equal(read(capture, cache).rgba, store.rgba)
-    assert not list(cache.glob("*.part"))
+    assert not list(cache.glob("*.part*"))
 
 
 SHARE = """

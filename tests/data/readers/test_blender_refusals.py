@@ -1,11 +1,13 @@
 """Blender captures that are refused, with where, what, and the cure; damaged pictures: test_images.py."""
 
 import json
+import os
 import re
 
 import pytest
 from PIL import Image
 from support.captures import picture, pose, write_blender
+from support.waiting import fifo, within
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.messages.errors import InputError
@@ -44,9 +46,9 @@ def test_refuses_settings(root, settings, message):
 
 def test_names_what_a_wrong_folder_holds(tmp_path):
     refused(tmp_path / "none", r"The folder .*none does not exist. Set scene.root")
-    refused(tmp_path, r"transforms_train.json does not exist; the folder holds nothing. Set scene.root")
+    refused(tmp_path, r"transforms_train.json does not exist; the folder holds nothing. Put the file")
     (tmp_path / "transforms.json").touch()
-    refused(tmp_path, r"the folder holds transforms.json. Set scene.root")
+    refused(tmp_path, r"the folder holds transforms.json. Put the file")
 
 
 @pytest.mark.parametrize(
@@ -111,3 +113,10 @@ def test_images_of_another_size_are_left_out(root, caplog):
     Image.fromarray(picture(0, 6, 4)).save(root / "val" / "r_1.png")
     assert len(BlenderReader(str(root)).read().view_names) == 13
     assert re.search(r"must all have one size. Most are 8 x 8, but \S+val/r_1.png is 6 x 4. Render", caplog.text)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="FIFOs are posix's")
+def test_a_fifo_in_the_place_of_the_training_views_is_called_one(tmp_path):
+    fifo(tmp_path / "transforms_train.json")
+    with within(5):
+        refused(tmp_path, r"transforms_train.json is a named pipe \(FIFO\), and only regular files")

@@ -1,5 +1,6 @@
 """Broken captures, format by format: one paragraph that says where, what, and the cure; never another exception."""
 
+import os
 import re
 import struct
 import zlib
@@ -32,7 +33,9 @@ from support.posed_captures import (
     write_pictures,
     write_transforms,
 )
+from support.waiting import fifo, within
 
+from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.messages.errors import InputError
 
 
@@ -72,7 +75,7 @@ PANORAMA = {"camera_model": "EQUIRECTANGULAR"}
 JSON = "transforms.json"
 
 TRANSFORMS = {
-    "no json": (lambda root: (root / JSON).unlink(), r"json does not exist; the folder holds images. Point scene.root"),
+    "no json": (lambda root: (root / JSON).unlink(), r"json does not exist; the folder holds images. Put the file"),
     "cut short": (text(JSON, lambda old: old[:-20]), r"json is not valid json: .* at line 1, column \d+. Export it"),
     "ten thousand digits": (text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"), r"not usable json: .*digits"),
     "a key twice": (text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")), r"key 'fl_x' appears twice"),
@@ -145,7 +148,7 @@ NPY = "poses_bounds.npy"
 NO_ARRAY = r"poses_bounds.npy cannot be read \(ValueError"
 LLFF = {
     "no folder": (lambda root: root.rename(root.parent / "b"), r"The folder .*capture does not exist. Set scene.root"),
-    "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Point scene.root"),
+    "no poses": (lambda root: (root / NPY).unlink(), r"npy does not exist; the folder holds images\. Put the file"),
     "cut short": (text(NPY, lambda old: old[:-9]), NO_ARRAY + ".*imgs2poses.*scene=colmap"),
     "an archive": (archived, NO_ARRAY),
     "no bounds": (rows(lambda old: old[:, :15]), r"is 9 x 15 of float64, but each view needs one row of 17 numbers"),
@@ -210,7 +213,7 @@ PINHOLE = (20.0, 20.0, 8.0, 6.0)
 FAR_POINT = r"sparse/0: 1 of (1|60) sparse points are NaN or beyond 1e\+09, and are left out"
 COLMAP = {
     "no model": (lambda root: (root / "sparse").rename(root / ".sparse"), r"holds no COLMAP model: .* sparse, "),
-    "half a model": (lambda root: (root / IMAGES).unlink(), r"images.bin cannot be read \(FileNotFoundError"),
+    "half a model": (lambda root: (root / IMAGES).unlink(), r"images.bin does not exist; the folder holds cameras"),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not supported"),
     "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
@@ -287,7 +290,10 @@ PHOTOGRAPHS = {
     "no pixels": (picture(lambda _: png_header(0, 0)), r"p_3.png is not an image that can be read. Copy or render"),
     "200 megapixels": (picture(lambda _: png_header(20_000, 10_000)), r"more than 178 megapixels;"),
     "HEIC": (picture(lambda _: b"\0\0\0\x18ftypheic" + bytes(100)), r"p_3.png is a photograph in the format HEIC"),
-    "a link to itself": (link_to_itself, r"(lacks the photograph p_3.png|p_3.png cannot be read)"),
+    "a link to itself": (
+        link_to_itself,
+        r"(lacks the photograph p_3.png|p_3.png is a symbolic link to .*, which leads nowhere)",
+    ),
 }
 ONE_VIEW = {
     "transforms": {
@@ -387,6 +393,23 @@ def test_settings_that_do_not_suit_the_capture(tmp_path, kind, write, settings, 
 )
 def test_a_folder_that_cannot_be_named(kind, root, message):
     refused(kind, root, message)
+
+
+NEEDED = {"transforms": JSON, "llff": NPY, "colmap": "sparse/0/cameras.txt"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="FIFOs and devices are posix's")
+@pytest.mark.parametrize(("kind", "name"), NEEDED.items())
+def test_what_is_no_file_in_the_place_of_one_is_called_what_it_is(tmp_path, kind, name):
+    path = fifo(tmp_path / name)
+    with within(5):
+        refused(kind, tmp_path, rf"{path.name} is a named pipe \(FIFO\), and only regular files are opened")
+        if kind != "colmap":
+            with pytest.raises(InputError, match=rf"it holds {name} \(a named pipe \(FIFO\)\)"):
+                AutoReader(root=str(tmp_path)).read()
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    refused(kind, tmp_path, rf"{path.name} is a device, and only regular files are opened")
 
 
 @pytest.mark.parametrize("aabb_scale", [1e12, float("nan")])

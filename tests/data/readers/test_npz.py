@@ -128,7 +128,7 @@ def test_refuses_files_that_are_no_npz(tmp_path, damage, message):
 
 
 def test_refuses_an_absent_file(tmp_path):
-    refused(tmp_path / "a.npz", r"The file \S+a.npz does not exist. Set scene.path")
+    refused(tmp_path / "a.npz", r"a.npz does not exist; the folder holds nothing. Put")
 
 
 @pytest.mark.data

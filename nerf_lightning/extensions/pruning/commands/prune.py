@@ -19,7 +19,7 @@ from nerf_lightning.extensions.pruning.narrower_model import shapes_of, widths_o
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.extensions.pruning.quantize import NumberType
 from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights
-from nerf_lightning.files.made_folders import below, make_folder
+from nerf_lightning.files.made_folders import child_of, make_folder
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
@@ -61,7 +61,7 @@ def run(config: DictConfig) -> float | None:
     quantized = quantized_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
     tuning = fine_tuning(wide, after, config.finetune_steps)
     with filled_folder(config.paths.output_dir, beside_checkpoint(wide.path, "pruned")) as folder:
-        target, run = make_folder(folder, "checkpoints") / LAST, below(folder, "finetuned")
+        target, run = make_folder(folder, "checkpoints") / LAST, child_of(folder, "finetuned")
         _require_own(target)
         if tuning is not None and (run / "run.json").exists():
             going_on = f"{to_type('resume', str(run))} {to_type('init_from', str(target))}"
