@@ -237,12 +237,23 @@ def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_
 
 def test_of_a_recorded_scene_settings_that_our_yaml_lacks_are_not_taken(tmp_path, monkeypatch, caplog):
     (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nof_mine: null\n")
+    (tmp_path / "scene" / "mine.yaml").write_text(
+        "_target_: mine.Reader\nroot: ???\nmasks: null\nnear: null\nof_mine: null\n"
+    )
     monkeypatch.setattr("nerf_lightning.files.folders.conf_folder", lambda: tmp_path)
-    scene = {"root": "data", "of_mine": 3, "not\x1b[2J in_it": 1, "allow_outside": True}
+    scene = {
+        "root": "data",
+        "of_mine": 3,
+        "not\x1b[2J in_it": 1,
+        "allow_outside": True,
+        "masks": "../../etc",
+        "near": float("nan"),
+    }
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
     assert scene_of(file) == ["scene=mine", "scene.root='data'", "scene.of_mine=3"]
     assert "\x1b" not in caplog.text
+    assert "scene.near" in caplog.text
+    assert "scene.masks" in caplog.text
     assert "does not take them from a file. If they are yours" in caplog.text
 
 
