@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 from packaging.version import Version
 from torch import Tensor
 
@@ -40,6 +40,7 @@ OF_A_RUN: dict[str, Any] = {
     "world_size": int,
 }
 OPTIONAL: dict[str, Any] = {"refined": Cameras, "pixels": Int[Tensor, "views"], "quantized": Quantized}
+OPTIONAL["depths"] = Float64[Tensor, "views 4"]
 FILE: dict[str, Any] = {"state_dict": dict[str, Tensor], "global_step": int, KEY: object}
 TRAINING: dict[str, Any] = {
     "epoch": int,
@@ -53,7 +54,7 @@ TRAINING: dict[str, Any] = {
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
 SIDES: dict[str, tuple[int, ...]] = {"c2w": (3, 4), "focal": (2,), "center": (2,), "lens": (6,), "ndc": (2,)}
-SIDES |= dict.fromkeys(("width", "height", "near", "far", "pixels"), ())
+SIDES |= dict.fromkeys(("width", "height", "near", "far", "pixels"), ()) | {"depths": (4,)}
 """Of what there is for each view, behind the views."""
 
 
