@@ -27,11 +27,12 @@ log = logging.getLogger(__name__)
 def depth_sums(scene: Scene) -> Float[Tensor, "views 4"]:
     """Return what tells the depths that a view is trained on from others, but for rounding; zeros where it has none.
 
-    Depths are of sparse points or a sensor. The sums are those of their certainties, alone and times depth, depth * x
+    Depths are of sparse points or a sensor; what follows from the photographs (`doctor.triangulation`) changes with
+    these, and with the machine. The sums are those of their certainties, alone and times depth, depth * x
     and depth * y, where depths are in the user's units and x and y in pixels.
     """
     sums = torch.zeros(len(scene.view_names), 4, dtype=torch.float64)
-    if scene.depths is None:
+    if scene.depths is None or scene.depths.from_pictures:
         return sums
     depths = scene.depths[torch.isin(scene.depths.pixels.view, torch.tensor(scene.splits["train"]))]
     depth = depths.distance.double() * unit_of(scene.to_user.double())

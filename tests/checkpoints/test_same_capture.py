@@ -113,6 +113,7 @@ def test_depths_that_are_learned_from_are_part_of_a_capture():
     swapped = record(measured(pixels=replace(at, x=at.x.flip(0))))
     assert [each[:10] for each in changes(before, swapped)] == ["the depths"]
     assert changes(before, record(SCENE)) == changes(before, after)
+    assert not depth_sums(measured(from_pictures=True)).any()
     in_half_units = measured(in_another_frame(SCENE), distance=distance / 2)
     torch.testing.assert_close(depth_sums(in_half_units), before["depths"])
     moved = with_cameras(c2w=changed_at(SCENE.cameras.c2w, 2, 0, 3, by=0.01))

@@ -200,6 +200,15 @@ def test_the_first_difference_of_a_record_is_named(nerf, tmp_path, change, words
     assert not (tmp_path / "out").exists()
 
 
+def test_test_views_that_were_trained_on_are_said_once(tmp_path, caplog):
+    apart, overlapping = {"train": (0, 1, 2), "val": (3, 4), "test": (3, 4)}, {"train": (0, 1, 2), "test": (2, 3)}
+    for _ in range(2):
+        loaded(write_checkpoint(tmp_path / "a.ckpt", recorded(splits=apart)))
+        loaded(write_checkpoint(tmp_path / "b.ckpt", recorded(splits=overlapping)))
+    (said_once,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert "b.ckpt: 1 of 3 training views are also validation or test views (ball_2), whose scores say" in said_once
+
+
 WEIGHT = "model.levels.fine.field.feature.weight"
 WEIGHTS = {
     "missing": (lambda weights: weights.pop(WEIGHT), "Missing key"),
