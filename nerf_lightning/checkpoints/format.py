@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from jaxtyping import Int, jaxtyped
+from jaxtyping import Float64, Int, jaxtyped
 from packaging.version import Version
 from torch import Tensor
 
@@ -42,7 +42,12 @@ OF_A_RUN: dict[str, Any] = {
     "num_threads": Annotated[int, 1, MOST_THREADS],
     "world_size": int,
 }
-OPTIONAL: dict[str, Any] = {"refined": Cameras, "pixels": Int[Tensor, "views"], "quantized": Quantized}
+OPTIONAL: dict[str, Any] = {
+    "refined": Cameras,
+    "pixels": Int[Tensor, "views"],
+    "depths": Float64[Tensor, "views 4"],
+    "quantized": Quantized,
+}
 FILE: dict[str, Any] = {"state_dict": dict[str, Tensor], "global_step": int, KEY: object}
 TRAINING: dict[str, Any] = {
     "epoch": int,

@@ -1,4 +1,4 @@
-"""Whether a run goes on with the capture that it has learned from: cameras, names, splits, pixels."""
+"""Whether a run goes on with the capture that it has learned from: cameras, names, splits, pixels, depths."""
 
 import logging
 from collections.abc import Iterable, Mapping
@@ -10,22 +10,41 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import poses_from_user
+from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
+from nerf_lightning.nerf.types.scene import Scene
 
 CLOSE = 1e-5
 """Two readings of one capture, on machines that round otherwise, differ by less: in the entries of a rotation, and as a
 share of a focal length or of the farthest camera's distance."""
 PIXEL = 1e-3
+DEPTH = 1e-6
+"""As a share of a sum over the depths of a photograph."""
 INTRINSICS = {"focal": "focal length", "center": "principal point", "lens": "lens", "width": "size", "height": "size"}
 
 log = logging.getLogger(__name__)
+
+
+def depth_sums(scene: Scene) -> Float[Tensor, "views 4"]:
+    """Return what tells the depths that a view is trained on from others, but for rounding; zeros where it has none.
+
+    Depths are of sparse points or a sensor; what follows from the photographs (`doctor.triangulation`) changes with
+    these, and with the machine. The sums are those of their certainties, alone and times depth, depth * x
+    and depth * y, where depths are in the user's units and x and y in pixels.
+    """
+    sums = torch.zeros(len(scene.view_names), 4, dtype=torch.float64)
+    if scene.depths is None or scene.depths.from_pictures:
+        return sums
+    depths = scene.depths[torch.isin(scene.depths.pixels.view, torch.tensor(scene.splits["train"]))]
+    depth = depths.distance.double() * unit_of(scene.to_user.double())
+    terms = torch.stack([torch.ones_like(depth), depth, depth * depths.pixels.x, depth * depths.pixels.y], dim=1)
+    return sums.index_add_(0, depths.pixels.view, depths.certainty.double()[:, None] * terms)
 
 
 def require_same_capture(there: Mapping[str, Any], here: Mapping[str, Any], allow_changed: bool) -> None:
     """Refuse a capture that is not the one of a checkpoint, or warn of it.
 
     Args:
-        there: the checkpoint's record; without hashes of pixels where an earlier version wrote it.
+        there: the checkpoint's record; without hashes of pixels, or sums of depths, where an earlier version wrote it.
         here: the run's.
         allow_changed: go on all the same.
 
@@ -61,9 +80,13 @@ def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     say("pose", _moved(old, new, a, b))
     for key, what in _intrinsics(old["cameras"], new["cameras"], a, b).items():
         say(key, what)
+    same_cameras = not found  # on which depths depend
     if "pixels" in there and "pixels" in here:
         say("pixels", there["pixels"][a] != here["pixels"][b])
     say("use (training, validation or test)", _used_otherwise(old["splits"], new["splits"], a, b))
+    if "depths" in there and "depths" in here and same_cameras:
+        was, now = there["depths"][a], here["depths"][b]
+        say("depths (of sparse points or depth maps)", ((was - now).abs() > DEPTH * was.abs()).any(dim=1))
     # What follows from views and settings goes with them, and is told only where it is all there is to tell.
     return found or _extent(old, new)
 

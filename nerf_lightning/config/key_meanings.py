@@ -11,6 +11,7 @@ holds: a setting of a trusted group that says where to write, what to fetch or h
 
 import hashlib
 import json
+import math
 import os
 import re
 from dataclasses import dataclass, replace
@@ -18,35 +19,38 @@ from enum import Enum, auto
 from typing import Any
 
 WORD = re.compile(r"\w[\w-]*", re.ASCII)
+LEADS_OUT = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.([/\\]|\Z)")
 
 
 class Trust(Enum):
-    """What is taken of a setting from a file that may come from anybody."""
+    """What is taken of a setting from a file that may come from anybody: finite numbers, switches, null, some texts."""
 
     PLAIN = auto()
-    """A number, a switch, null or a text that looks nothing up."""
+    """Texts that look nothing up, and paths that stay below the folder from where they are meant."""
     WORDS = auto()
-    """As PLAIN, but of texts only single words: a path or an address is none."""
+    """Single words: a path or an address is none."""
     NUMBERS = auto()
-    """As PLAIN, without texts."""
+    """No texts."""
+    PLACE = auto()
+    """Paths of the capture, wherever it lies."""
     IF_THERE = auto()
-    """As PLAIN, but a path only of what exists: some scenes put there what they fetch."""
+    """As PLACE, but only of what exists: some scenes put there what they fetch."""
     ONE_START = auto()
     """Nothing: it belonged to one start of a run, and the next one has its own."""
     NOTHING = auto()
     """Nothing: a file that holds it is refused, or it is passed over where the file need not be believed."""
 
     def takes(self, value: Any) -> bool:
-        """Tell whether a value that is no list and no section is taken."""
-        if not isinstance(value, str):
-            return self not in (Trust.ONE_START, Trust.NOTHING) and (
-                value is None or isinstance(value, (bool, int, float))
-            )
-        if self is Trust.WORDS:
-            return WORD.fullmatch(value) is not None
-        if self is Trust.IF_THERE and not os.path.exists(os.path.expanduser(value)):
+        """Return whether a value is taken; a list or a section as a whole is not."""
+        if self in (Trust.ONE_START, Trust.NOTHING):
             return False
-        return self in (Trust.PLAIN, Trust.IF_THERE) and "${" not in value
+        if not isinstance(value, str):
+            return value is None or isinstance(value, int) or (isinstance(value, float) and math.isfinite(value))
+        if self in (Trust.WORDS, Trust.NUMBERS):
+            return self is Trust.WORDS and WORD.fullmatch(value) is not None
+        if self is Trust.PLAIN and LEADS_OUT.search(value):
+            return False
+        return "${" not in value and (self is not Trust.IF_THERE or os.path.exists(os.path.expanduser(value)))
 
 
 @dataclass(frozen=True)
@@ -62,9 +66,7 @@ class Meaning:
     shown: bool = True
     """It has a column in a table of runs that differ in it."""
     trust: Trust = Trust.NOTHING
-    """What is taken of it from a run folder, or from a checkpoint."""
-    in_sweep: Trust | None = None
-    """What is taken of it from the record of a sweep; None: as from a run folder."""
+    """What is taken of it from a run folder, the record of a sweep, or a checkpoint."""
 
 
 UNKNOWN = Meaning()
@@ -75,9 +77,7 @@ PART = Meaning(trust=Trust.WORDS)
 LEARNT = Meaning(trust=Trust.PLAIN)
 # It tells whose results they are, and stands in a table's own column.
 OWN_COLUMN = Meaning(learnt=False, shown=False, trust=Trust.PLAIN)
-# The checkpoint that the first start began from. Jobs of a sweep that have not begun start from there still.
-FIRST_START = Meaning(learnt=False, trust=Trust.ONE_START, in_sweep=Trust.PLAIN)
-# The machine, and how it computes.
+# The machine, and how it computes; the checkpoint that a run began from.
 MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
 # How long a run lasts: a longer one goes on with a shorter one's checkpoints.
 LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
@@ -97,10 +97,10 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         "optimizer.** scheduler.** data.** callbacks.collapse_guard.**",
     ),
     (LEARNT, "scene.** trainer.clip_norm"),
-    (OWN_COLUMN, "seed model scene scene.name scene.root scene.video"),
+    (OWN_COLUMN, "seed model scene scene.name"),
+    (replace(OWN_COLUMN, trust=Trust.PLACE), "scene.root scene.video"),
     (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
-    (FIRST_START, "init_from"),
-    (MACHINE, "trainer.**"),
+    (MACHINE, "trainer.** init_from"),
     (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched otherwise
     (LENGTH, "budget.** trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
@@ -110,20 +110,19 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
     (UNKNOWN, "scene.download.**"),
-    # How a sweep is cut into jobs and how many there are: its record may say so. What they run is no number or word.
-    (replace(OF_THE_USER, in_sweep=Trust.NUMBERS), "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
+    # How a sweep is cut into jobs and how many there are; what they run is no number or word.
+    (replace(OF_THE_USER, trust=Trust.NUMBERS), "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
     (
-        replace(OF_THE_USER, in_sweep=Trust.WORDS),
+        replace(OF_THE_USER, trust=Trust.WORDS),
         "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction",
     ),
 )
 
 CHOSEN_GROUPS = (
     *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment"),
-    *("field", "logger", "loss", "model"),
-    *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
+    *("field", "loss", "model", "optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
-"""Groups of conf/ of which a file may choose an option by its name."""
+"""Groups of conf/ of which a file may choose an option by its name. No loggers: they send pictures to accounts."""
 SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
 """And those of which the record of a sweep may."""
 
@@ -142,36 +141,19 @@ def meaning_of(key: str) -> Meaning:
     ('PLAIN', 'NOTHING')
     """
     found = TABLE.get(row_of(key) or "", UNKNOWN)
-    if names_a_class(key) and found.trust is not Trust.ONE_START:
-        return replace(found, trust=Trust.NOTHING, in_sweep=None)
-    return found
+    is_refused = names_a_class(key) and found.trust is not Trust.ONE_START
+    return replace(found, trust=Trust.NOTHING) if is_refused else found
 
 
 def row_of(key: str) -> str | None:
     """Return the entry of the table that decides about a key, None where none does."""
-    above = key.rpartition(".")[0]
-    names = (key, f"{above}.*", *(f"{section}.**" for section in _sections(key)))
-    return next((name for name in names if name in TABLE), None)
-
-
-def is_removable(section: str) -> bool:
-    """Tell whether a file may take a section or a setting away: all that is known of it must be taken from files."""
-    below = [meaning for key, meaning in TABLE.items() if key.startswith(f"{section}.")]
-    return all(each.trust not in (Trust.ONE_START, Trust.NOTHING) for each in (*below, meaning_of(section)))
-
-
-def _sections(key: str) -> list[str]:
-    """Return a key and what it lies in, the smallest first.
-
-    >>> _sections("a.b.c")
-    ['a.b.c', 'a.b', 'a']
-    """
     words = key.split(".")
-    return [".".join(words[:count]) for count in range(len(words), 0, -1)]
+    sections = (".".join([*words[:count], "**"]) for count in range(len(words), 0, -1))
+    return next((name for name in (key, ".".join([*words[:-1], "*"]), *sections) if name in TABLE), None)
 
 
 def names_a_class(key: str) -> bool:
-    """Tell whether a key is Hydra's own, such as `_target_`."""
+    """Return whether a key is Hydra's own, such as `_target_`."""
     return any(word.startswith("_") for word in key.split("."))
 
 

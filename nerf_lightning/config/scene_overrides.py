@@ -15,9 +15,6 @@ from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal, listed
 
-PLAIN = (bool, int, float, str)
-TAKEN = (Trust.PLAIN, Trust.IF_THERE)
-
 log = logging.getLogger(__name__)
 
 
@@ -66,19 +63,22 @@ def _settings_of(file: Path) -> dict[str, Any]:
 
 def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[str, Any]:
     """Return what is taken from a file: plain values of settings that our yaml has and the table trusts to files."""
-    unknown = [key for key in recorded if key not in ours and not names_a_class(key)]
-    if unknown:
+    taken = {key: value for key, value in recorded.items() if key in ours and _is_taken(key, value)}
+    texts_and_numbers = [key for key in ours if isinstance(recorded.get(key), str | float)]
+    refused = [key for key in texts_and_numbers if key not in taken and meaning_of(key).trust is Trust.PLAIN]
+    refused += [key for key in recorded if key not in ours and not names_a_class(key)]
+    if refused:
         log.warning(
-            "%s was trained with %s. This program does not know these settings and does not take them from a file. If "
-            "they are yours, type them.",
+            "%s was trained with %s. This program does not know these settings, or they are infinite or lead out of "
+            "the capture, so it does not take them from a file. If they are yours, type them.",
             for_terminal(path),
-            listed(unknown, cap=5),
+            listed(refused, cap=5),
         )
-    return {
-        key: value
-        for key, value in recorded.items()
-        if key in ours and meaning_of(key).trust in TAKEN and (value is None or isinstance(value, PLAIN))
-    }
+    return taken
+
+
+def _is_taken(key: str, value: Any) -> bool:
+    return (key in PLACES and isinstance(value, str)) or meaning_of(key).trust.takes(value)
 
 
 def _found(place: str, checkpoint: Path) -> str:

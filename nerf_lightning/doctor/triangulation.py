@@ -37,7 +37,7 @@ def with_distances(scene: Scene) -> Scene:
         return scene
     with torch_threads(1):  # Pictures are spread over our own threads.
         found = ranks.from_first(lambda: triangulated(scene))
-    return scene if found is None else replace(scene, depths=found)
+    return scene if found is None else replace(scene, depths=replace(found, from_pictures=True))
 
 
 def triangulated(scene: Scene) -> KnownDepths | None:

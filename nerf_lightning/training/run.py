@@ -9,6 +9,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.same_capture import depth_sums
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.compose import chosen
 from nerf_lightning.config.instantiate import build, required_path
@@ -63,6 +64,8 @@ def assemble(
     step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
         log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
+    if step.loss.depth_every:
+        record["depths"] = depth_sums(scene)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch, depth_every=step.loss.depth_every

@@ -7,16 +7,17 @@ import torch
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
-from nerf_lightning.checkpoints.same_capture import changes, require_same_capture
+from nerf_lightning.checkpoints.same_capture import changes, depth_sums, require_same_capture
 from nerf_lightning.data.pixels import decoding as hashes
 from nerf_lightning.data.pixels.decoding import photograph_hashes
 from nerf_lightning.nerf.geometry.frames import poses_from_user
+from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 
 SCENE = ball_scene()
 
 
 def record(scene):
-    return make_record(scene, "", {}) | {"pixels": photograph_hashes(scene.pixels)}
+    return make_record(scene, "", {}) | {"pixels": photograph_hashes(scene.pixels), "depths": depth_sums(scene)}
 
 
 def told(scene):
@@ -94,6 +95,30 @@ def test_one_pose_that_moves_the_frame_is_one_pose_and_a_mask_is_part_of_a_photo
     masked = with_pixels(mask=mask)
     other = with_pixels(mask=changed_at(mask, 0, by=255))
     assert changes(record(masked), record(other)) == ["the pixels of 1 of 6 photographs (ball_0)"]
+
+
+def measured(scene=SCENE, **changed):
+    """The scene, with a depth at three pixels of each view."""
+    view, at = torch.arange(18) // 3, torch.arange(18) % 7
+    depths = KnownDepths(PixelIndex(view, at, at), 1.0 + at, torch.full((18,), 0.5))
+    return replace(scene, depths=replace(depths, **changed))
+
+
+def test_depths_that_are_learned_from_are_part_of_a_capture():
+    distance, before = measured().depths.distance, record(measured())
+    for by, views in ((1e-8 * distance, ""), (0.01, "3 of 6 photographs (ball_0, ball_1, ball_2)")):
+        after = record(measured(distance=distance + by))  # the other three are held out
+        assert changes(before, after) == [f"the depths (of sparse points or depth maps) of {views}"] * bool(views)
+    at = measured().depths.pixels
+    swapped = record(measured(pixels=replace(at, x=at.x.flip(0))))
+    assert [each[:10] for each in changes(before, swapped)] == ["the depths"]
+    assert changes(before, record(SCENE)) == changes(before, after)
+    assert not depth_sums(measured(from_pictures=True)).any()
+    in_half_units = measured(in_another_frame(SCENE), distance=distance / 2)
+    torch.testing.assert_close(depth_sums(in_half_units), before["depths"])
+    moved = with_cameras(c2w=changed_at(SCENE.cameras.c2w, 2, 0, 3, by=0.01))
+    assert changes(before, record(moved)) == ["the pose of 1 of 6 photographs (ball_2)"]
+    assert changes(make_record(SCENE, "", {}), before) == []
 
 
 def test_a_checkpoint_of_before_has_no_hashes_and_is_compared_by_what_it_has():

@@ -202,6 +202,15 @@ def test_the_first_difference_of_a_record_is_named(nerf, tmp_path, change, words
     assert not (tmp_path / "out").exists()
 
 
+def test_test_views_that_were_trained_on_are_said_once(tmp_path, caplog):
+    apart, overlapping = {"train": (0, 1, 2), "val": (3, 4), "test": (3, 4)}, {"train": (0, 1, 2), "test": (2, 3)}
+    for _ in range(2):
+        loaded(write_checkpoint(tmp_path / "a.ckpt", recorded(splits=apart)))
+        loaded(write_checkpoint(tmp_path / "b.ckpt", recorded(splits=overlapping)))
+    (said_once,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert "b.ckpt: 1 of 3 training views are also validation or test views (ball_2), whose scores say" in said_once
+
+
 WEIGHT = "model.levels.fine.field.feature.weight"
 WEIGHTS = {
     "missing": (lambda weights: weights.pop(WEIGHT), "Missing key"),
@@ -239,12 +248,23 @@ def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_
 
 def test_of_a_recorded_scene_settings_that_our_yaml_lacks_are_not_taken(tmp_path, monkeypatch, caplog):
     (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nof_mine: null\n")
+    (tmp_path / "scene" / "mine.yaml").write_text(
+        "_target_: mine.Reader\nroot: ???\nmasks: null\nnear: null\nof_mine: null\n"
+    )
     monkeypatch.setattr("nerf_lightning.files.folders.conf_folder", lambda: tmp_path)
-    scene = {"root": "data", "of_mine": 3, "not\x1b[2J in_it": 1, "allow_outside": True}
+    scene = {
+        "root": "data",
+        "of_mine": 3,
+        "not\x1b[2J in_it": 1,
+        "allow_outside": True,
+        "masks": "../../etc",
+        "near": float("nan"),
+    }
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
     assert scene_of(file) == ["scene=mine", "scene.root='data'", "scene.of_mine=3"]
     assert "\x1b" not in caplog.text
+    assert "scene.near" in caplog.text
+    assert "scene.masks" in caplog.text
     assert "does not take them from a file. If they are yours" in caplog.text
 
 

@@ -15,6 +15,7 @@ from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.runs import saved_overrides
 from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep, to_give_again
 from nerf_lightning.runs.summary import read_note
@@ -131,6 +132,15 @@ PLANTED = [
     "scene.allow_outside=true",
     "scene={download:{url:https://x/y}}",
     "scene.path=not_there.npz",
+    # What leads out of a capture.
+    "path.file=/etc/shadow",
+    "scene.masks=../../etc",
+    "scene.masks=masks/../../etc",
+    "scene.masks={a:['~/secret']}",
+    "evaluation.lpips_weights='C:\\weights.pth'",
+    # Numbers that are none.
+    "optimizer.lr=nan",
+    "optimizer.betas=[0.9,-inf]",
     # Paths where there are words, groups that nobody has decided about, and what is no override.
     "encoder.unheard_of=/tmp/evil",
     "unheard/of=any",
@@ -169,6 +179,8 @@ IN_SWEEPS = [
     "+seed=choice(1,{a:'${oc.env:HOME}'})",
     "++callbacks.evil=choice({_target_:os.system},{_target_:os.popen})",
     "scene.allow_outside=true,false",
+    "optimizer.lr=1e-3,nan",
+    "init_from=/elsewhere/last.ckpt",
     "scene.path=not_there.npz,neither.npz",
 ]
 
@@ -197,6 +209,19 @@ def test_what_belongs_to_one_start_is_left_out(run, kind, line):
     leave(kind, run, line, "seed=1")
     assert repeated(kind, run) == ["seed=1"]
     assert kind == "sweep" or to_give_again([line]) == []
+
+
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_loggers_are_typed_again(run, kind, caplog):
+    leave(kind, run, "logger=wandb", "seed=1")
+    assert repeated(kind, run) == ["seed=1"]
+    assert [record.getMessage().partition(": ")[2] for record in caplog.records] == [
+        "to log as before, type logger=wandb again."
+    ]
+    assert to_give_again(["logger=wandb", "seed=1"], of_sweep=kind == "sweep") == ["logger=wandb"]
+    caplog.clear()
+    assert repeated(kind, run, "logger=csv") == ["seed=1"]
+    assert not caplog.records
 
 
 def test_values_that_are_paths_name_no_folders(tmp_path):
@@ -347,12 +372,17 @@ def test_a_run_folder_that_no_event_file_can_lie_in_is_refused(tmp_path, key):
     assert not place.exists()
 
 
-def test_more_overrides_than_agreed_are_not_read(run):
+def test_hydras_parser_gets_nothing_that_keeps_it_busy(run, monkeypatch):
     leave("run", run, "path.views=[" + "1," * 1000 + "1]")
     assert len(repeated("run", run)) == 1
-    leave("run", run, "path.views=[" + "1," * 40_000 + "1]")
-    with pytest.raises(InputError, match=r"overrides.yaml holds more than 65,536 characters"):
+    leave("run", run, *["seed=1"] * 2000)
+    with pytest.raises(InputError, match=r"overrides.yaml holds more than 8,192 characters"):
         repeated("run", run)
+    monkeypatch.setattr(saved_overrides, "parse", lambda line: pytest.fail("it is parsed"))
+    for line in ("seed=[" + "1," * 2000, "seed=" + "{a:" * 500, "seed=" + "f(" * 500):
+        leave("run", run, line)
+        with pytest.raises(InputError, match="is not taken from a file"):
+            repeated("run", run)
 
 
 @pytest.mark.parametrize("value", ["x", [], None, 10**400, float("nan")])

@@ -89,7 +89,7 @@ def texts_in(annotation):
 
 
 def test_every_group_is_one_that_a_file_may_choose_from_or_decidedly_none():
-    others = {"hydra", "output", "budgets", "viewer", "what"}
+    others = {"hydra", "logger", "output", "budgets", "viewer", "what"}
     assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"}
     for group in others:
         assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group
@@ -106,4 +106,3 @@ def test_a_new_reader_part_or_callback_has_the_row_of_its_group():
 @pytest.mark.parametrize("key", ["model._target_", "scene._target_", "model.levels.fine._args_", "_target_.x"])
 def test_of_the_name_of_a_class_nothing_is_taken(key):
     assert meaning_of(key).trust is Trust.NOTHING
-    assert meaning_of(key).in_sweep is None

@@ -45,6 +45,7 @@ def test_cameras_that_contradict_the_photographs_tell_nothing(bricks):
 def test_what_a_capture_knows_itself_stays(bricks):
     known = with_distances(bricks)
     assert known.depths is not None
+    assert known.depths.from_pictures
     assert with_distances(known) is known
     assert with_distances(replace(bricks, capture_of=(0,) * len(bricks.view_names))).depths is None
 

@@ -1,6 +1,8 @@
 """Runs that are trained step by step: guarded, saved, resumed to the bit, rendered on the way."""
 
 import json
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from support.orbit import LENS, SIZE, orbit_cameras, orbit_masks, orbit_scene
 from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning as nl
+from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 from nerf_lightning.training.step import TrainStep
 
 SMALL = ("model=nerf_tiny", "trainer=cpu", "data.batch_rays=64", "data.crop_steps=3")
@@ -56,6 +59,20 @@ def test_a_resumed_run_has_the_weights_of_one_that_never_stopped(settings, scene
     assert [metrics["step"] for metrics in rest.steps(6)] == [3, 4, 5, 6]
     assert equal(weights(whole), weights(rest))
     assert equal(whole.optimizer.state_dict()["state"], rest.optimizer.state_dict()["state"])
+
+
+def test_a_run_goes_on_with_the_depths_that_it_has_learned_from(pinholes, tmp_path):
+    at, view = torch.arange(8), torch.tensor(pinholes.splits["train"][:1]).expand(8)
+    depths, file = KnownDepths(PixelIndex(view, at, at), torch.ones(8), torch.ones(8)), tmp_path / "a.ckpt"
+    one, other = (replace(pinholes, depths=replace(depths, distance=depths.distance * n)) for n in (1, 2))
+    for loss in ("mse", "depth"):
+        run = nl.build_run(*SMALL, f"loss={loss}", scene=one)
+        next(run.steps(1))
+        run.save(file)
+        again = partial(nl.build_run, *SMALL, f"loss={loss}", scene=other, resume=file)
+        if loss == "mse":
+            assert again().num_steps == 1
+    refused(again, parts=("the depths (of sparse points or depth maps) of 1 of 6 photographs",))
 
 
 @pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:Using ModelCheckpoint", "ignore:Be aware")

@@ -3,6 +3,7 @@
 import logging
 import math
 from dataclasses import replace
+from functools import cache
 from typing import get_args
 
 import torch
@@ -13,7 +14,7 @@ from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed, require_printable
+from nerf_lightning.messages.escaping import for_terminal, listed, require_printable
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, SceneRecord
@@ -217,7 +218,7 @@ def _alike(row: Tensor, wanted: Tensor) -> bool:
 
 
 def check_scene(scene: SceneRecord, where: str) -> None:
-    """Refuse numbers that are no scene's, whether a reader or a checkpoint says them.
+    """Refuse numbers that are no scene's, whether a reader or a checkpoint says them; warn of splits that overlap.
 
     Args:
         scene: of annotated shapes and kinds, and finite.
@@ -243,10 +244,10 @@ def check_scene(scene: SceneRecord, where: str) -> None:
     _check_similarity(scene.to_user.double())
     if scene.metres_per_unit is not None and not LEAST_UNIT <= scene.metres_per_unit <= LARGEST_UNIT:
         raise Mismatch("scene.metres_per_unit", "is no length")
-    _check_splits(scene, views)
+    _check_splits(scene, views, where)
 
 
-def _check_splits(scene: SceneRecord, views: int) -> None:
+def _check_splits(scene: SceneRecord, views: int, where: str) -> None:
     for split, numbers in scene.splits.items():
         if split not in ("train", "val", "test", "sources") or not set(numbers) <= set(range(views)):
             raise Mismatch(f"scene.splits.{split}", f"names views that are not among the {views}")
@@ -254,9 +255,21 @@ def _check_splits(scene: SceneRecord, views: int) -> None:
             raise Mismatch(f"scene.splits.{split}", "names a view twice")
     if not scene.splits.get("train"):
         raise Mismatch("scene.splits", "has no views to train on")
+    held_out = {*scene.splits.get("val", ()), *scene.splits.get("test", ())}
+    both = tuple(scene.view_names[view] for view in scene.splits["train"] if view in held_out)
+    if both:
+        _warn_of_overlap(where, both, len(scene.splits["train"]))
     of = scene.capture_of
     if of is not None and not (len(of) == views and set(of) <= set(range(len(scene.captures)))):
         raise Mismatch("scene.capture_of", f"is not one of {len(scene.captures)} captures for each view")
+
+
+@cache  # a command may read a checkpoint several times
+def _warn_of_overlap(where: str, names: tuple[str, ...], of: int) -> None:
+    log.warning(
+        "%s: %d of %d training views are also validation or test views (%s), whose scores say nothing about new views.",
+        *(for_terminal(where), len(names), of, listed(names, 3)),
+    )
 
 
 def check_cameras(cameras: Cameras, place: str, where: str) -> None:

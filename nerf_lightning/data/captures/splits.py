@@ -47,21 +47,15 @@ def apart(
 ) -> tuple[View, ...]:
     """Return the views to learn from without those to judge by, and say which are left out.
 
-    Where a capture lists the very same views for training and test, that is meant, and said. `named` returns a view's
-    name, and `source` lists them.
+    Where a capture lists the very same views for training and test, that is meant; `checks.check_scene` warns of it.
+    `named` returns a view's name, and `source` lists them.
 
     Raises:
         InputError: less than half of the views to learn from would be left, so that either list may be the mistake.
     """
     held = {*val, *test}
     both = [view for view in train if view in held]
-    if not both:
-        return tuple(train)
-    if set(train) == set(test):
-        log.warning(
-            "%s: the training views are also the test views, so scores will say nothing about new views.",
-            source,
-        )
+    if not both or set(train) == set(test):
         return tuple(train)
     names = listed(map(named, both), cap=5)
     left = len(train) - len(both)

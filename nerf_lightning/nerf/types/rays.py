@@ -137,6 +137,8 @@ class KnownDepths(TensorStruct):
     """Along the unit ray through the pixel, scene units."""
     certainty: Float[Tensor, "known"]
     """In (0, 1]: 1 / (1 + (relative error / `CERTAIN`)^2)."""
+    from_pictures: bool = False
+    """Whether they follow from the photographs, and are none of the capture's own."""
 
     def __len__(self) -> int:
         return len(self.distance)

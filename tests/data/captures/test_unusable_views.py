@@ -8,6 +8,7 @@ from support.captures import write_blender, write_npz
 from support.malformed import edit_json, refused
 from support.posed_captures import Known, read, write_colmap, write_transforms
 
+from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.messages.errors import InputError
@@ -36,7 +37,8 @@ def test_one_list_for_both_is_meant_and_said(tmp_path, caplog):
         scene = read("transforms", with_lists(tmp_path / str(count), NAMES[:count], NAMES[:count]))
         assert scene.splits["train"] == scene.splits["test"] == tuple(range(count))
         assert scene.protocol["test_views"] == "learned from"
-    assert "the training views are also the test views" in caplog.text
+        make_record(scene, "", {})
+        assert f"The scene: {count} of {count} training views are also validation or test views" in caplog.text
 
 
 def test_a_picture_in_two_blender_files_is_one_view(tmp_path, caplog):
