@@ -7,12 +7,14 @@ without waiting, and asked what it is once it is open: nobody can put another on
 import codecs
 import errno
 import io
+import math
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from nerf_lightning.files.budgets import limits, require_text_within, require_within
 from nerf_lightning.messages.errors import InputError
 
 # Of posix; Windows has neither FIFOs nor devices among its files.
@@ -29,12 +31,13 @@ KINDS = (
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
 
 
-def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
+def open_regular(path: Path, size: str | int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
     """Open a regular file for reading.
 
     Args:
         path: where it lies.
-        most_bytes: its largest size; None where the reader itself takes no more than it has checked.
+        size: its kind (`ply`), whose budget limits its bytes (`budgets.ply_bytes`); a number of bytes; or None where
+            the reader itself takes no more than it has checked.
         cure: what to do about what is no such file, for the message.
         follow_links: open what a symbolic link leads to; where it may lead is for the caller to say.
 
@@ -42,7 +45,7 @@ def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_li
         InputError: it is no regular file, is larger, or is a link that is not followed.
         OSError: it cannot be opened.
     """
-    return os.fdopen(_opened(path, os.O_RDONLY, most_bytes, cure, follow_links), "rb")
+    return os.fdopen(_opened(path, os.O_RDONLY, size, cure, follow_links), "rb")
 
 
 def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
@@ -55,23 +58,56 @@ def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
 
 
-def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
-    """Return the content of a regular file."""
-    with explained(path, cure), open_regular(path, most_bytes, cure) as file:
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:  # it has grown
-        raise InputError(_too_large(path, len(content), most_bytes, cure))
-    return content
+def read_bytes(path: Path, size: str | int, cure: str = CURE) -> bytes:
+    """Return the content of a regular file, as large as it was when it was opened; `size` as of `open_regular`."""
+    with explained(path, cure), open_regular(path, size, cure) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
-def read_text(path: Path, most_bytes: int, cure: str = CURE) -> str:
-    """Return the content of a text file in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
-    content = io.BytesIO(read_bytes(path, most_bytes, cure))
+def read_text(path: Path, kind: str, cure: str = CURE) -> str:
+    """Return a text file of a kind (`json`) in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
+    content = io.BytesIO(read_bytes(path, kind, cure))
     try:
-        return io.TextIOWrapper(content, encoding_of(content)).read()
+        text = io.TextIOWrapper(content, encoding_of(content)).read()
     except UnicodeError as error:
         where = f" (byte {error.start} is not UTF-8)" if isinstance(error, UnicodeDecodeError) else ""
         raise InputError(f"{path} is not a text file{where}. {cure}") from error
+    require_text_within(kind, text, path)
+    return text
+
+
+def read_lines(file: io.BufferedReader, encoding: str) -> Iterator[str]:
+    """Return the lines of a text one at a time, each no longer than `budgets.text_bytes`: a sparse file is one line.
+
+    Raises:
+        ValueError: a longer line, or no text.
+    """
+    lines, most = io.TextIOWrapper(file, encoding, newline="\n"), limits().text_bytes
+    for number, line in enumerate(iter(lambda: lines.readline(most + 1), ""), start=1):
+        if len(line) > most:
+            raise ValueError(f"line {number} has more than {most:,} characters")
+        yield line
+
+
+class HeaderReader(io.BufferedReader):
+    """Read an open file within a budget until `left` is None: a header may claim to be all of a large sparse file."""
+
+    left: int | None
+
+    def __init__(self, file: io.BufferedReader, left: int, budget: str, where: Path, what: str) -> None:
+        super().__init__(file.raw)
+        self.seek(0)
+        self.left, self.refusal = left, (budget, math.inf, where, what)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes."""
+        if self.left is None:
+            return super().read(size)
+        content = super().read(self.left + 1 if size is None or size < 0 else min(size, self.left + 1))
+        self.left -= len(content)
+        if self.left < 0:
+            require_within(*self.refusal)
+        return content
 
 
 def encoding_of(file: io.BufferedIOBase) -> str:
@@ -92,7 +128,7 @@ def explained(path: Path, cure: str = CURE) -> Iterator[None]:
         raise InputError(f"{path} cannot be read: {error}. {cure}") from error
 
 
-def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_links: bool) -> int:
+def _opened(path: Path, flags: int, size: str | int | None, cure: str, follow_links: bool) -> int:
     link = 0 if follow_links else NO_LINK
     try:
         handle = os.open(path, flags | WITHOUT_WAITING | BINARY | link, 0o666)
@@ -106,8 +142,10 @@ def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_li
         state = os.fstat(handle)
         if not stat.S_ISREG(state.st_mode):
             raise InputError(_of_another_kind(path, _kind(state.st_mode) or "no regular file", cure))
-        if most_bytes is not None and state.st_size > most_bytes:
-            raise InputError(_too_large(path, state.st_size, most_bytes, cure))
+        if isinstance(size, str):
+            require_within(f"{size}_bytes", state.st_size, path, "bytes")
+        elif size is not None and state.st_size > size:
+            raise InputError(f"{path} has {state.st_size:,} bytes, more than the limit of {size:,}. {cure}")
     except BaseException:
         os.close(handle)
         raise
@@ -127,7 +165,3 @@ def _kind(mode: int) -> str | None:
 
 def _of_another_kind(path: Path, kind: str, cure: str) -> str:
     return f"{path} is {kind}, and only regular files are opened here. {cure}"
-
-
-def _too_large(path: Path, size: int, most_bytes: int, cure: str) -> str:
-    return f"{path} has {size:,} bytes, more than the limit of {most_bytes:,}. {cure}"

@@ -241,7 +241,7 @@ def test_large_pictures_are_decoded_one_at_a_time(tmp_path, monkeypatch):
         monkeypatch.setattr(images, "LARGE", least)
         read = threading.Event()
         other = threading.Thread(target=lambda read=read: (images.read_rgba(tmp_path / "a.png"), read.set()))
-        with images._opened(tmp_path / "a.png"):
+        with images.opened_picture(tmp_path / "a.png"):
             other.start()
             assert read.wait(timeout=0.3 if waits else 30) is not waits
         other.join()
