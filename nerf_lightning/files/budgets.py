@@ -99,4 +99,4 @@ MARKS = {"json": "[{,:", "xml": "<=", "yaml": "[{,:-?\n", "text": " \t\n"}
 def require_text_within(kind: str, text: str, where: str | Path) -> None:
     """Refuse a text that is too long, or has too many elements."""
     require_within(f"{kind}_bytes", len(text), where, "characters")
-    require_within(f"{kind}_values", sum(map(text.count, MARKS[kind])), where, "values")
+    require_within(f"{kind}_values", sum(map(text.count, MARKS[kind])), where, "separators of values")

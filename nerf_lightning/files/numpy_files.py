@@ -1,10 +1,12 @@
-"""Files of numpy's: never unpickled, and no larger in memory than the budgets allow."""
+"""Files of numpy's: never unpickled, and no larger in memory than on the disk, or than the budgets allow."""
 
+import math
+import os
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -19,24 +21,50 @@ ENTRY_BYTES = 100
 
 
 def read_npy(path: Path, cure: str) -> Shaped[ndarray, "..."]:
-    """Return the array of an .npy file: by its own format, since np.load opens archives, too."""
+    """Return the array of an .npy file."""
     with reading(path, cure), open_regular(path, "npy", cure) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+        return _array(file, os.fstat(file.fileno()).st_size)
 
 
 @contextmanager
-def open_npz(path: Path, cure: str) -> Iterator[Any]:
-    """Open an .npz file as numpy does: arrays by name, each of which is read when it is asked for."""
+def open_npz(path: Path, cure: str) -> Iterator[Mapping[str, ndarray]]:
+    """Open an .npz file: its arrays by name, each of which is read when it is asked for."""
     with reading(path, cure), open_regular(path, "npz", cure) as opened:
         file = HeaderReader(opened, ENTRY_BYTES * limits().npz_arrays, "npz_arrays", path, "arrays")
         with zipfile.ZipFile(file) as archive:  # hands out no more of an entry than the size that it announces
-            entries = archive.infolist()
-        require_within("npz_arrays", len(entries), path, "arrays")
-        require_within("npz_bytes", sum(entry.file_size for entry in entries), path, "bytes once it is unpacked")
-        file.left = None
-        file.seek(0)
-        with np.load(file, allow_pickle=False) as arrays:
-            yield arrays
+            require_within("npz_arrays", len(archive.infolist()), path, "arrays")
+            size = sum(entry.file_size for entry in archive.infolist())
+            require_within("npz_bytes", size, path, "bytes once it is unpacked")
+            file.left = None
+            yield _Arrays(archive)
+
+
+class _Arrays(Mapping[str, ndarray]):
+    def __init__(self, archive: zipfile.ZipFile):
+        self.archive = archive
+        self.entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+
+    def __getitem__(self, name: str) -> ndarray:
+        entry = self.entries[name]
+        with self.archive.open(entry) as file:
+            return _array(file, entry.file_size)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
+def _array(file: IO[bytes], size: int) -> Shaped[ndarray, "..."]:
+    """Return the array of a file of so many bytes; numpy itself takes the memory that a header claims."""
+    version = np.lib.format.read_magic(file)
+    of_version = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = of_version(file)
+    if math.prod(shape) * kind.itemsize > size:
+        raise ValueError(f"it claims the shape {shape}, and has {size:,} bytes")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def read_columns(lines: Iterable[str], columns: list[int], count: int) -> Float[ndarray, "rows columns"]:

@@ -82,11 +82,12 @@ def read_lines(file: io.BufferedReader, encoding: str) -> Iterator[str]:
     Raises:
         ValueError: a longer line, or no text.
     """
-    lines, most = io.TextIOWrapper(file, encoding, newline="\n"), limits().text_bytes
-    for number, line in enumerate(iter(lambda: lines.readline(most + 1), ""), start=1):
-        if len(line) > most:
-            raise ValueError(f"line {number} has more than {most:,} characters")
-        yield line
+    most = limits().text_bytes
+    with io.TextIOWrapper(file, encoding, newline="\n") as lines:
+        for number, line in enumerate(iter(lambda: lines.readline(most + 1), ""), start=1):
+            if len(line) > most:
+                raise ValueError(f"line {number} has more than {most:,} characters")
+            yield line
 
 
 class HeaderReader(io.BufferedReader):

@@ -44,8 +44,8 @@ MODELS = {
 }
 """COLMAP's numbers of camera models, with their names and counts of parameters."""
 COUNTS = dict(MODELS.values())
-LONGEST_NAME = 1 << 12
-"""In bytes, as file systems have it."""
+LONGEST_NAME = 1 << 14
+"""In bytes."""
 MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
 """Points, spread over all, whose tracks are read, up to `budgets.points` entries; photographs that a track may have."""
 CURE = "Copy the model again, or run the reconstruction again (nerf poses images=DIR)."
