@@ -1,5 +1,6 @@
 """Files of numpy's: never unpickled, and no larger in memory than on the disk, or than the budgets allow."""
 
+import io
 import math
 import os
 import zipfile
@@ -56,7 +57,7 @@ class _Arrays(Mapping[str, ndarray]):
         return len(self.entries)
 
 
-def _array(file: IO[bytes], size: int) -> Shaped[ndarray, "..."]:
+def _array(file: IO[bytes] | io.BufferedIOBase, size: int) -> Shaped[ndarray, "..."]:
     """Return the array of a file of so many bytes; numpy itself takes the memory that a header claims."""
     version = np.lib.format.read_magic(file)
     of_version = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -177,7 +177,7 @@ def test_pickles_in_arrays(tmp_path):
 
 def test_what_an_archive_may_unpack_to_is_a_setting(tmp_path):
     path = write_npz(tmp_path / "a.npz")
-    for most in ({"npz_arrays": 2}, {"npz_bytes": path.stat().st_size}):
+    for most in ({"npz_arrays": 2}, {"npz_bytes": 1000}):
         with budget(**most), pytest.raises(InputError, match=rf"a.npz has .* the limit .* budgets.{next(iter(most))}="):
             NpzReader(str(path)).read()
     assert NpzReader(str(path)).read().view_names
