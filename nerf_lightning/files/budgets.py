@@ -1,49 +1,52 @@
-"""What a file may cost before a person has agreed: the one table of sizes that are taken from a file unasked.
+"""What a file may cost before the user agrees: the one table of limits, for each container its bytes and its elements.
 
-Files come from anybody. Each limit is far above what sound files need, and low enough that nothing fills the memory or
-runs for hours. A person who knows better raises it on the command line (`budgets.views=500000`); no file can.
+Files come from anybody. Each limit is far above what valid files need, and low enough that no file fills the memory or
+runs for hours. Users raise limits on the command line (`budgets.views=500000`); no file can.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 
 from nerf_lightning.messages.errors import InputError
 
 
 @dataclass(frozen=True)
 class Budgets:
-    """How much of each kind, at most."""
+    """Limits on what is read: `KIND_bytes` of a file of each kind, and the elements that it may hold."""
 
-    views: int = 200_000
-    """Photographs of a capture."""
-    points: int = 10_000_000
-    """Sparse points of a capture."""
-    view_pixels: int = 1 << 28
-    """Pixels of one camera's picture."""
-    megapixels: int = 178
-    """Size of a picture file that is decoded, in millions of pixels."""
-    samples_per_ray: int = 1 << 12
-    """Points that a model asks its field about along one ray, at once."""
-    layer_width: int = 1 << 12
-    """Features that a model holds of one point, in any of its layers."""
-    intervals: int = 1 << 17
-    """Steps of a march through an occupancy grid, from near to far."""
     json_bytes: int = 1 << 26
-    """Of a json file."""
-    json_lists: int = 2_000_000
-    """Lists and objects in a json file, each of which takes a hundred times its bytes in memory."""
-    yaml_characters: int = 1 << 20
-    """Of a yaml text."""
+    json_values: int = 4_000_000  # keys and values, counted by commas, colons and opening brackets
+    xml_bytes: int = 1 << 26
+    xml_values: int = 2_000_000  # tags and attributes
+    yaml_bytes: int = 1 << 20
+    yaml_values: int = 100_000  # keys and values, counted by what begins or parts them
+    text_bytes: int = 1 << 24  # of a list of names or numbers, and of one line of a larger text
+    text_values: int = 2_000_000  # words and lines
+    ply_bytes: int = 1 << 32
+    colmap_bytes: int = 1 << 36
+    views: int = 200_000  # photographs of a capture
+    points: int = 10_000_000  # sparse points of a capture, and entries of their tracks
+    npy_bytes: int = 1 << 28
+    npz_bytes: int = 2_000_000_000  # unpacked
+    npz_arrays: int = 500_000
+    image_bytes: int = 1 << 30
+    image_header_bytes: int = 1 << 24  # before the first pixel of a JPEG
+    megapixels: int = 178  # of an image file, and of a frame of a video
+    view_pixels: int = 1 << 28  # of one camera's picture
+    video_bytes: int = 1 << 38
+    video_frames: int = 1_000_000
     tensor_bytes: int = 1 << 36
-    """Of a PyTorch file."""
-    unpacked_bytes: int = 1 << 32
-    """Of the weights that a checkpoint keeps in fewer bytes (nerf prune), as they are in memory."""
-    event_bytes: int = 1 << 29
-    """Of a run's TensorBoard files."""
-    film_frames: int = 100_000
-    """Of a camera path; an hour at 24 frames per second is less."""
-    folders: int = 1_000_000
-    """That are searched for runs."""
+    tensor_objects: int = 1 << 24  # bytes of a PyTorch file that are not numbers
+    unpacked_bytes: int = 1 << 32  # of a checkpoint's quantized weights (nerf prune), in memory
+    event_bytes: int = 1 << 29  # of a run's TensorBoard files
+    event_values: int = 1_000_000
+    film_frames: int = 100_000  # of a camera path: more than an hour at 24 frames per second
+    folders: int = 1_000_000  # that are searched for runs
+    samples_per_ray: int = 1 << 12  # points along one ray at which a model evaluates its field at once
+    layer_width: int = 1 << 12  # features per point in any layer of a model
+    intervals: int = 1 << 17  # steps of a ray through an occupancy grid, from near to far
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -78,11 +81,22 @@ def allow_as_typed(arguments: Iterable[str]) -> None:
     set_limits(Budgets(**typed))
 
 
-def require_within(name: str, found: int, where: str, what: str) -> None:
-    """Refuse what costs more than a person has agreed to: `found` of a `what`, where the budget `name` allows fewer."""
+def require_within(name: str, count: int | float, where: str | Path, what: str) -> None:
+    """Refuse more of `what` than the budget `name` allows; `count` is infinite where counting stopped at the limit."""
     most = getattr(limits(), name)
-    if found > most:
+    if count > most:
+        is_known = not math.isinf(count)
         raise InputError(
-            f"{where} has {found:,} {what}, more than the limit of {most:,}. If you trust it, add "
-            f"budgets.{name}={found}; otherwise use another file."
+            f"{where} has {f'{count:,} {what}, more' if is_known else f'more {what}'} than the limit of {most:,}. If "
+            f"you trust it, add budgets.{name}={count if is_known else 2 * most}; otherwise use another file."
         )
+
+
+MARKS = {"json": "[{,:", "xml": "<=", "yaml": "[{,:-?\n", "text": " \t\n"}
+"""Of each kind of text, what begins or parts its elements: counted, they are an upper bound before anything is read."""
+
+
+def require_text_within(kind: str, text: str, where: str | Path) -> None:
+    """Refuse a text that is too long, or has too many elements."""
+    require_within(f"{kind}_bytes", len(text), where, "characters")
+    require_within(f"{kind}_values", sum(map(text.count, MARKS[kind])), where, "separators of values")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -17,17 +16,20 @@ CURE = "Export it again, or fix it with a JSON checker."
 
 def read_json(path: Path) -> Any:
     """Return the content of a json file."""
+    return parse_json(read_text(path, "json", CURE), path)
+
+
+def parse_json(text: str, where: Path) -> Any:
+    """Return the content of a json text, which is `where`."""
     try:
-        text = read_text(path, limits().json_bytes, CURE)
-        require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
         return json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
+        raise InputError(f"{where} is not valid json: {error.msg} at {place}. {CURE}") from error
     except RecursionError as error:
-        raise InputError(f"{path} nests its brackets too deeply to be a capture. {CURE}") from error
+        raise InputError(f"{where} nests its brackets too deeply to be a capture. {CURE}") from error
     except ValueError as error:  # a number of thousands of digits
-        raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
+        raise InputError(f"{where} is not usable json: {error}. {CURE}") from error
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

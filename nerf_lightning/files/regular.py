@@ -9,40 +9,37 @@ import codecs
 import io
 import os
 import stat
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from nerf_lightning.files.budgets import limits, require_text_within, require_within
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 # Of posix; Windows has neither FIFOs nor devices among its files.
-WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-BINARY = getattr(os, "O_BINARY", 0)
+WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe (FIFO)",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFLNK: "a symbolic link",
+    **{stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe (FIFO)", stat.S_IFSOCK: "a socket"},
+    **{stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFLNK: "a symbolic link"},
 }
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
 MADE_AGAIN = "Remove it, and it will be made again."
 MOST_NAMES = 10  # Of a folder, in a message
-OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 class AbsentError(InputError):
     """Report that there is no file at a path."""
 
 
-def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
+def open_regular(path: Path, size: str | int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
     """Open a regular file for reading.
 
     Args:
         path: where it lies.
-        most_bytes: its largest size; None where the reader itself takes no more than it has checked.
+        size: its kind (`ply`), whose budget limits its bytes (`budgets.ply_bytes`); a number of bytes; or None where
+            the reader itself takes no more than it has checked.
         cure: what to do about what is no such file, for the message.
         follow_links: open what a symbolic link leads to; where it may lead is for the caller to say.
 
@@ -50,7 +47,7 @@ def open_regular(path: Path, most_bytes: int | None, cure: str = CURE, follow_li
         AbsentError: there is none.
         InputError: it is no regular file, is larger, is a link that is not followed, or cannot be opened.
     """
-    return os.fdopen(_opened(path, os.O_RDONLY, most_bytes, cure, follow_links), "rb")
+    return os.fdopen(_opened(path, os.O_RDONLY, size, cure, follow_links), "rb")
 
 
 def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
@@ -58,9 +55,9 @@ def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
 
 
-def open_own(path: Path, most_bytes: int | None) -> io.BufferedReader:
+def open_own(path: Path, size: str | int | None) -> io.BufferedReader:
     """Open a file of a folder that is the user's own (see `open_regular`); others' files are refused, and links."""
-    file = open_regular(path, most_bytes, MADE_AGAIN, follow_links=False)
+    file = open_regular(path, size, MADE_AGAIN, follow_links=False)
     try:
         require_own(path, os.fstat(file.fileno()), MADE_AGAIN)
     except InputError:
@@ -71,29 +68,45 @@ def open_own(path: Path, most_bytes: int | None) -> io.BufferedReader:
 
 def require_own(path: Path, state: os.stat_result, cure: str) -> None:
     """Refuse a file or folder that somebody else can have written; Windows does not tell."""
-    mode = stat.S_IMODE(state.st_mode)
-    if os.name == "posix" and (state.st_uid != os.geteuid() or mode & OTHERS_MAY_WRITE):
-        strange = f"belongs to another user (number {state.st_uid})" if state.st_uid != os.geteuid() else ""
-        reason = strange or f"can be written by others (mode {mode:04o})"
+    mode, reason = stat.S_IMODE(state.st_mode), None
+    if os.name == "posix" and mode & (stat.S_IWGRP | stat.S_IWOTH):
+        reason = f"can be written by others (mode {mode:04o})"
+    if os.name == "posix" and state.st_uid != os.geteuid():
+        reason = f"belongs to another user (number {state.st_uid})"
+    if reason:
         raise InputError(f"{path} {reason}, so it may come from somebody else. {cure}")
 
 
-def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
-    """Return the content of a regular file."""
-    with open_regular(path, most_bytes, cure) as file:
-        content = file.read(most_bytes + 1)
-        _require_regular(path, os.fstat(file.fileno()), most_bytes, cure)  # it may have grown
-    return content
+def read_bytes(path: Path, size: str | int, cure: str = CURE) -> bytes:
+    """Return the content of a regular file, as large as it was when it was opened; `size` as of `open_regular`."""
+    with open_regular(path, size, cure) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
-def read_text(path: Path, most_bytes: int, cure: str = CURE) -> str:
-    """Return the content of a text file in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
-    content = io.BytesIO(read_bytes(path, most_bytes, cure))
+def read_text(path: Path, kind: str, cure: str = CURE) -> str:
+    """Return a text file of a kind (`json`) in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
+    content = io.BytesIO(read_bytes(path, kind, cure))
     try:
-        return io.TextIOWrapper(content, encoding_of(content)).read()
+        text = io.TextIOWrapper(content, encoding_of(content)).read()
     except UnicodeError as error:
         where = f" (byte {error.start} is not UTF-8)" if isinstance(error, UnicodeDecodeError) else ""
         raise InputError(f"{path} is not a text file{where}. {cure}") from error
+    require_text_within(kind, text, path)
+    return text
+
+
+def read_lines(file: io.BufferedReader, encoding: str) -> Iterator[str]:
+    """Return the lines of a text one at a time, each no longer than `budgets.text_bytes`: a sparse file is one line.
+
+    Raises:
+        ValueError: a longer line, or no text.
+    """
+    most = limits().text_bytes
+    with io.TextIOWrapper(file, encoding, newline="\n") as lines:
+        for number, line in enumerate(iter(lambda: lines.readline(most + 1), ""), start=1):
+            if len(line) > most:
+                raise ValueError(f"line {number} has more than {most:,} characters")
+            yield line
 
 
 def encoding_of(file: io.BufferedIOBase) -> str:
@@ -129,9 +142,9 @@ def contents(folder: Path) -> str:
     return listed([*map(str.__add__, names, notes), *names[MOST_NAMES:]], MOST_NAMES) or "nothing"
 
 
-def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_links: bool) -> int:
+def _opened(path: Path, flags: int, size: str | int | None, cure: str, follow_links: bool) -> int:
     try:
-        handle = os.open(path, flags | WITHOUT_WAITING | BINARY | (0 if follow_links else NO_LINK), 0o666)
+        handle = os.open(path, flags | WITHOUT_WAITING | (0 if follow_links else NO_LINK), 0o666)
     except (OSError, ValueError) as error:
         with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
             _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
@@ -140,16 +153,18 @@ def _opened(path: Path, flags: int, most_bytes: int | None, cure: str, follow_li
         held = "" if os.path.islink(path) else f"; the folder holds {contents(path.parent)}"
         raise AbsentError(f"{path} {what_is(path)}{held}. Put the file there, or give another path.") from error
     try:
-        _require_regular(path, os.fstat(handle), most_bytes, cure)
+        _require_regular(path, os.fstat(handle), size, cure)
     except BaseException:
         os.close(handle)
         raise
     return handle
 
 
-def _require_regular(path: Path, state: os.stat_result, most_bytes: int | None, cure: str) -> None:
+def _require_regular(path: Path, state: os.stat_result, size: str | int | None, cure: str) -> None:
     if not stat.S_ISREG(state.st_mode):
         kind = KINDS.get(stat.S_IFMT(state.st_mode), "no regular file")
         raise InputError(f"{path} is {kind}, and only regular files are opened here. {cure}")
-    if most_bytes is not None and state.st_size > most_bytes:
-        raise InputError(f"{path} has {state.st_size:,} bytes, more than the limit of {most_bytes:,}. {cure}")
+    if isinstance(size, str):
+        require_within(f"{size}_bytes", state.st_size, path, "bytes")
+    elif size is not None and state.st_size > size:
+        raise InputError(f"{path} has {state.st_size:,} bytes, more than the limit of {size:,}. {cure}")

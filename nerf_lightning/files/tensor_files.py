@@ -6,7 +6,6 @@ code of the file is executed, and its tensors take no more memory than the file.
 """
 
 import io
-import os
 import pickle
 import struct
 import zipfile
@@ -18,16 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerf_lightning.files.archives import start_of_directory
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
 
-OBJECT_BYTES = 1 << 23
-"""Largest pickle and largest directory of an archive: a byte of either can become a hundred in memory."""
 LEGACY = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
-END, END64, LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
-"""What an archive ends with; PyTorch always writes the records of zip64 (the latter two) before the first one."""
 LOCAL = struct.Struct("<4s22x2H")
 INSTRUCTIONS = (
     "PROTO STOP MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE EMPTY_LIST APPEND APPENDS "
@@ -46,7 +42,7 @@ def load_tensors(path: Path) -> Any:
         Mismatch: it is another kind of file, or holds anything else than tensors and plain containers.
         Exception: whatever zipfile, pickle and torch raise for a file that is damaged.
     """
-    with open_regular(path, limits().tensor_bytes) as file:
+    with open_regular(path, "tensor") as file:
         if file.read(len(LEGACY)) == LEGACY:
             raise InputError(
                 f"{path} is in PyTorch's format from before version 1.6, which is not read. If you trust it, convert "
@@ -63,7 +59,7 @@ def _entries(file: io.BufferedReader) -> dict[str, tuple[int, int, int]]:
     Raises:
         Mismatch: with what is not so.
     """
-    directory = _start_of_directory(file)
+    directory = start_of_directory(file, limits().tensor_objects)
     with zipfile.ZipFile(file) as archive:
         listed = sorted(archive.infolist(), key=lambda entry: entry.header_offset)
     entries, previous = dict[str, tuple[int, int, int]](), 0
@@ -77,25 +73,6 @@ def _entries(file: io.BufferedReader) -> dict[str, tuple[int, int, int]]:
             raise Mismatch("it", "holds a compressed entry, or two of one name; torch.save writes neither")
         entries[entry.filename], previous = (start, entry.file_size, entry.CRC), start + entry.file_size
     return entries
-
-
-def _start_of_directory(file: io.BufferedReader) -> int:
-    size, records = os.fstat(file.fileno()).st_size, END64.size + LOCATOR.size
-    file.seek(max(0, size - records - END.size))
-    tail = file.read().rjust(records + END.size, b"\0")
-    mark, *_, length, offset, _ = END.unpack_from(tail, records)
-    end = size - END.size
-    if tail.startswith(b"PK\x06\x07", END64.size):
-        end -= records
-        mark64, *_, length64, offset64 = END64.unpack_from(tail)
-        # The fields of 32 bits may leave the numbers to those of 64.
-        same = length in (length64, 0xFFFFFFFF) and offset in (offset64, 0xFFFFFFFF)
-        if mark64 != b"PK\x06\x06" or LOCATOR.unpack_from(tail, END64.size)[2] != end or not same:
-            raise Mismatch("it", "is not one archive: its end records contradict each other")
-        length, offset = length64, offset64
-    if mark != b"PK\x05\x06" or offset + length != end or length > OBJECT_BYTES:
-        raise Mismatch("it", "is not a checkpoint (one archive of torch.save), or was cut short")
-    return int(offset)
 
 
 def _view(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object) -> Tensor:
@@ -129,7 +106,7 @@ class _Unpickler(_Machine):
     def __init__(self, file: io.BufferedReader):
         self.file, self.entries, self.storages = file, _entries(file), dict[str, Tensor]()
         names = [name for name in self.entries if name.endswith("/data.pkl")]
-        if len(names) != 1 or self.entries[names[0]][1] > OBJECT_BYTES:
+        if len(names) != 1 or self.entries[names[0]][1] > limits().tensor_objects:
             raise Mismatch("it", "has no data.pkl, several, or one that is too large")
         self.root = names[0].removesuffix("data.pkl")
         if f"{self.root}byteorder" in self.entries and self._content("byteorder").tobytes() != b"little":

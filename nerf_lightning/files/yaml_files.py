@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from nerf_lightning.files.budgets import limits
+from nerf_lightning.files.budgets import require_text_within
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 
@@ -34,10 +34,9 @@ class _PlainLoader(yaml.SafeLoader):
         return node
 
 
-def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
+def plain_yaml(text: str, where: str | Path, cure: str = CURE) -> Any:
     """Return what a yaml text from anybody holds; `where` it stands, and the cure of a bad one, are for the message."""
-    if len(text) > limits().yaml_characters:
-        raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
+    require_text_within("yaml", text, where)
     try:
         content = yaml.load(text, Loader=_PlainLoader)
         _require_plain(content)
@@ -50,7 +49,7 @@ def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
 
 def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     """Return what a yaml file holds."""
-    return plain_yaml(read_text(path, 4 * limits().yaml_characters, cure), str(path), cure)
+    return plain_yaml(read_text(path, "yaml", cure), path, cure)
 
 
 def _require_plain(content: Any) -> None:

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from nerf_lightning.files.budgets import limits
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
@@ -122,8 +122,11 @@ def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:
 
 
 def _copy(files: list[Path], folder: Path) -> None:
-    left = limits().event_bytes
+    size = values = 0
     for file in files:
-        content = read_bytes(file, left, "Leave it out of the folder.")
-        left -= len(content)
+        content = read_bytes(file, "event", "Leave it out of the folder.")
+        # A scalar and its tag begin with the byte 10 each; so may, by chance, one byte in 256 of a picture.
+        size, values = size + len(content), values + content.count(b"\n")
+        require_within("event_bytes", size, file.parent, "bytes of TensorBoard files")
+        require_within("event_values", values, file.parent, "values in its TensorBoard files")
         (folder / file.name).write_bytes(content)

@@ -9,7 +9,6 @@ from urllib.parse import quote
 from nerf_lightning.checkpoints.reading import newest_checkpoint
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.export.page_file import is_page
-from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
@@ -127,7 +126,7 @@ def _validation_pictures(run: Path) -> list[Path]:
 
 def _add_config(report: Report, run: Path) -> None:
     config = run / ".hydra" / "config.yaml"
-    text = read_text(config, 4 * limits().yaml_characters)
+    text = read_text(config, "yaml")
     plain_yaml(text, str(config))  # a config at all
     report.config = text
     overrides = read_plain_yaml(run / ".hydra" / "overrides.yaml")

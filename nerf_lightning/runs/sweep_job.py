@@ -4,7 +4,6 @@ Jobs may run in other processes and on other machines; what the sweep's own proc
 files in the sweep's folder. A job that fails returns None, so that the sweep goes on with the others.
 """
 
-import json
 import logging
 import os
 import signal
@@ -18,14 +17,12 @@ from omegaconf import DictConfig
 
 from nerf_lightning.compute.slurm import was_requeued
 from nerf_lightning.config.messages import paragraph
-from nerf_lightning.files.json_files import number, write_json
+from nerf_lightning.files.json_files import number, read_json, write_json
 from nerf_lightning.files.made_folders import make_folder, remove_empty
-from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.identity import settings_digest
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 
 NUM_JOBS = "NERF_LIGHTNING_JOBS"  # In the environment of the jobs: how many there are
-MOST_BYTES = 1 << 20  # Of a record
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +120,7 @@ def read_records(sweep_folder: Path) -> list[JobRecord]:
     """Return what the jobs of a sweep have left, in their order."""
     # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
     files = records_folder(sweep_folder).glob("[!.]*.json")
-    records = [JobRecord(**json.loads(read_text(file, MOST_BYTES))) for file in files]
+    records = [JobRecord(**read_json(file)) for file in files]
     return sorted(records, key=lambda record: record.number)
 
 

@@ -36,7 +36,7 @@ KINDS = {"a named pipe (FIFO)": fifo, "a folder": folder, "a socket": of_socket,
 OPENED = {
     "open_regular": lambda path: open_regular(path, 10, "Mend it."),
     "read_bytes": lambda path: read_bytes(path, 10, "Mend it."),
-    "read_text": lambda path: read_text(path, 10, "Mend it."),
+    "read_text": lambda path: read_text(path, "text", "Mend it."),
 }
 
 
@@ -74,8 +74,10 @@ def test_a_larger_file_is_refused_before_it_is_read(tmp_path):
     with path.open("wb") as file:
         file.truncate(1 << 40)
     for open_ in OPENED.values():
-        with pytest.raises(InputError, match=r"it has 1,099,511,627,776 bytes, more than the limit of 10"):
+        with pytest.raises(InputError, match=r"it has 1,099,511,627,776 bytes, more than the limit of 1"):
             open_(path)
+    with pytest.raises(InputError, match=r"limit of 16,777,216\. .* add budgets\.text_bytes=1099511627776"):
+        read_text(path, "text")
     open_regular(path, None).close()
 
 
@@ -85,7 +87,7 @@ def test_regular_files_are_read_and_appended_to(tmp_path):
         with open_to_append(path) as file:
             file.write("ü\r\n".encode())
     assert read_bytes(path, 8) == b"\xc3\xbc\r\n" * 2
-    assert read_text(path, 8) == "ü\n" * 2
+    assert read_text(path, "text") == "ü\n" * 2
     with open_regular(path, 8) as file:
         assert file.read() == path.read_bytes()
 
@@ -93,7 +95,7 @@ def test_regular_files_are_read_and_appended_to(tmp_path):
 def test_what_is_no_text_is_named(tmp_path):
     (tmp_path / "it").write_bytes(b"ab\xff")
     with pytest.raises(InputError, match=r"it is not a text file \(byte 2 is not UTF-8\)"):
-        read_text(tmp_path / "it", 10)
+        read_text(tmp_path / "it", "text")
 
 
 @pytest.mark.parametrize("name", ["absent", "nul\0", "x" * 300, "folder/it"])

@@ -7,7 +7,8 @@ import nerf_lightning
 
 PACKAGE = Path(nerf_lightning.__file__).parent
 READS = {"read_text", "read_bytes", "open", "imread", "imiter", "fromfile", "memmap", "FileHandler"}
-LOADERS = {"np", "torch", "OmegaConf"}
+PARSES = {"loads", "fromstring", "iterparse", "XMLParser", "loadtxt", "genfromtxt", "read_array", "safe_load"}
+LOADERS = {"np", "torch", "OmegaConf", "json", "yaml", "pickle", "ElementTree"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
     "config/instantiate.py": ["load"],
@@ -25,14 +26,14 @@ OURS = {
     "training/loggers.py": ["open"],
     "runs/sweep.py": ["print"],
     "evaluation/protocol.py": ["read_text"],
-    "training/launch/processes.py": ["open", "read_text"],
-    "config/scene_overrides.py": ["read_text"],
-    "config/exporters.py": ["read_text"],
-    "data/readers/auto.py": ["read_text"],
+    "training/launch/processes.py": ["open"],
+    "config/scene_overrides.py": ["read_text", "safe_load"],
+    "config/exporters.py": ["read_text", "safe_load"],
+    "data/readers/auto.py": ["read_text", "safe_load"],
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "files/html.py": ["read_text"],
-    "runs/published.py": ["read_text"],
+    "runs/published.py": ["read_text", "safe_load"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_text"],
     "cli/worker.py": ["load", "load"],
@@ -46,9 +47,10 @@ OTHERWISE = {
     "data/bricks/cache.py": ["load"],
     "data/bricks/parts.py": ["read_text"],
     "data/pixels/images.py": ["open"],
-    "files/numpy_files.py": ["load"],
-    "data/sfm/gps.py": ["open"],
-    "data/sfm/photograph_folder.py": ["open", "open"],
+    "files/json_files.py": ["loads"],
+    "files/numpy_files.py": ["loadtxt", "open", "read_array"],
+    "files/xml_files.py": ["fromstring"],
+    "files/yaml_files.py": ["load"],
     "data/pixels/decoding.py": ["open"],
     "data/pixels/plain_background.py": ["open"],
     "data/sfm/reconstruction.py": ["open"],
@@ -63,9 +65,9 @@ OTHERWISE = {
 def calls(file):
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call):
-            if isinstance(node.func, ast.Attribute) and (node.func.attr in READS or _loads(node.func)):
+            if isinstance(node.func, ast.Attribute) and (node.func.attr in READS | PARSES or _loads(node.func)):
                 yield node.func.attr
-            elif isinstance(node.func, ast.Name) and node.func.id in ("open", "print"):
+            elif isinstance(node.func, ast.Name) and node.func.id in {"open", "print"} | PARSES:
                 yield node.func.id
 
 

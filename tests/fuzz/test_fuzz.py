@@ -144,7 +144,7 @@ KINDS = {
     "llff": Kind(lambda f: write_llff(f / "capture", KNOWN), capture("llff"), ("capture/poses_bounds.npy",)),
     "npz": Kind(
         lambda f: np.savez(f / "a.npz", **npz_content(count=4)),
-        lambda f: usable(NpzReader(str(f / "a.npz"), max_gigabytes=0.1).read()),
+        lambda f: usable(NpzReader(str(f / "a.npz")).read()),
         ("a.npz",),
     ),
     **{

@@ -41,7 +41,7 @@ def usable(capture: Capture) -> Capture:
     Raises:
         InputError: too few views remain.
     """
-    require_within("views", len(capture.views), str(capture.source), "views")
+    require_within("views", len(capture.views), capture.source, "views")
     if not capture.views and not capture.left_out.faults:
         raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
     views, scales = zip(*map(_without_scale, capture.views), strict=True) if capture.views else ((), ())

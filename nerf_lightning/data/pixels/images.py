@@ -1,6 +1,7 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
 import logging
+import math
 import mmap
 import os
 import re
@@ -20,7 +21,7 @@ from jaxtyping import Bool, UInt8, UInt16
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, HEIC_KINDS, UNREAD, decoders
-from nerf_lightning.files.budgets import limits
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.row_chunks import row_chunks
@@ -37,7 +38,7 @@ PIXELS_AT_ONCE = 1 << 16
 """That are shrunk together: what is computed of them stays in the cache."""
 MOST_IN_32_BITS = (2**32 - 1) // (255 * (2 * 255 + 1))
 """Pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
-JPEG_BLOCK = 64
+JPEG_START, JPEG_BLOCK = b"\xff\xd8\xff", 64
 """Pixels of a block."""
 JPEG_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd9-\xfe]")
 """Those with a length. Decoders pass over the others, which have none: restarts among the pixels (0xd0 to 0xd7), TEM
@@ -49,8 +50,6 @@ ONE_PICTURE = (*JPEGS, "HEIF")
 JPEG_SCAN, JPEG_END = 0xDA, 0xD9
 SOUND_SCANS, MOST_SCANS = 20, 100
 """Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
-BYTES_PER_PIXEL = 16
-"""Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
 CURE = "Copy or render it again; PNG, JPEG, TIFF, WebP and AVIF are read."
 DECODER_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error),
@@ -84,7 +83,7 @@ def read_header(path: Path) -> PictureHeader:
         InputError: the file is absent, empty, of no known format, too large to be decoded safely, holds several
             pictures, or has a pixel mode with no plain reading as 8-bit color.
     """
-    with _opened(path) as image:
+    with opened_picture(path) as image:
         try:
             exif = image.getexif() if image.format != "PNG" or "exif" in image.info else {}
             orientation = exif.get(ORIENTATION, 1)
@@ -101,7 +100,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def is_heic(path: Path) -> bool:
     """Tell whether a file begins as phones' HEIC photographs do, whatever its name."""
     try:
-        with open_picture(path) as file:
+        with open_regular(path, None) as file:
             start = file.read(12)
     except (OSError, InputError):
         return False
@@ -121,7 +120,7 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
     Raises:
         InputError: what `read_header` refuses, or damaged or truncated.
     """
-    with _opened(path) as image:
+    with opened_picture(path) as image:
         if _is_deep(image):
             with _saying:
                 _say_reduced(path.parent)
@@ -156,7 +155,7 @@ def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
     Raises:
         InputError: what `read_header` refuses, damaged, or of another kind.
     """
-    with _opened(path) as image:
+    with opened_picture(path) as image:
         if image.mode not in GREY_16:
             raise InputError(f"The depth map {path} is not a 16-bit grayscale picture. Save it as a 16-bit PNG.")
         try:
@@ -259,37 +258,48 @@ def _block_means(rgba: UInt8[np.ndarray, "height width 4"], factor: int) -> UInt
     return small
 
 
-def open_picture(path: Path) -> BufferedReader:
-    """Open a file to be decoded.
+class _JpegHeader(BufferedReader):
+    """A JPEG's file that refuses to read a longer header than `budgets.image_header_bytes`."""
 
-    Raises:
-        InputError: it is no regular file, or is larger than any picture of `budgets.megapixels`.
-        OSError: it cannot be opened.
-    """
-    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * limits().megapixels, CURE)
+    def __init__(self, file: BufferedReader, path: Path):
+        super().__init__(file.raw)
+        self.left, self.path = float(limits().image_header_bytes), path
+        self.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes."""
+        content = super().read(size)
+        self.left -= len(content)
+        if self.left < 0:
+            require_within("image_header_bytes", math.inf, self.path, "bytes of header")
+        return content
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open the file, read its header, and refuse what has no one plain reading."""
+def opened_picture(path: Path) -> Iterator[Image.Image]:
+    """Open a picture file and read its header; no pixel is decoded.
+
+    Raises:
+        InputError: what `read_header` refuses.
+    """
     if cure := UNREAD.get(path.suffix.lower()):
         raise InputError(f"{path} cannot be read. {cure}")
-    most = limits().megapixels
     with ExitStack() as opened:
         try:
-            file = opened.enter_context(open_picture(path))
+            file = opened.enter_context(open_regular(path, "image", CURE))
+            if file.peek(3).startswith(JPEG_START):  # Pillow joins its EXIF in quadratic time
+                file = opened.enter_context(_JpegHeader(file, path))
             with _filters, warnings.catch_warnings():
                 # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                Image.MAX_IMAGE_PIXELS = most * 500_000
+                Image.MAX_IMAGE_PIXELS = limits().megapixels * 500_000
                 image = opened.enter_context(Image.open(file, formats=decoders()))
-        except Image.DecompressionBombError as error:
-            raise InputError(
-                f"{path} claims more than {most} megapixels; more is not safe to decode, because a small file can "
-                f"claim any number. Shrink it first, or, if you trust it, add budgets.megapixels={2 * most}."
-            ) from error
+        except Image.DecompressionBombError:
+            require_within("megapixels", math.inf, path, "megapixels")
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
+        if isinstance(file, _JpegHeader):
+            file.left = math.inf
         if image.format in JPEGS:
             _check_jpeg(image, file, path)
         _check_plain(image, path)
@@ -329,10 +339,10 @@ def jpeg_scans(content: bytes | mmap.mmap) -> int:
 
 def _check_plain(image: Image.Image, path: Path) -> None:
     """Refuse several pictures in one file, and pixel modes that are no 8-bit color."""
-    frames = _num_frames(image, path)
-    if frames > 1:
+    # What a JPEG or HEIC carries beside its own picture (previews, depth) is none; counting pages would read them all.
+    if image.format not in ONE_PICTURE and getattr(image, "is_animated", False):
         raise InputError(
-            f"{path} holds {frames} pictures (an animation, or pages), and it is unclear which one is meant. Save each "
+            f"{path} holds several pictures (an animation, or pages), and it is unclear which one is meant. Save each "
             "as a file of its own, for example with ffmpeg or `magick`, and name the one that belongs here."
         )
     if image.mode == "CMYK":
@@ -345,16 +355,6 @@ def _check_plain(image: Image.Image, path: Path) -> None:
             f"{path} has the pixel mode {image.mode!r}, which cannot be read unambiguously as 8-bit color. Save it as "
             "an 8-bit RGB or RGBA PNG."
         )
-
-
-def _num_frames(image: Image.Image, path: Path) -> int:
-    """Return how many pictures the file shows; what a JPEG or HEIC carries beside its own (previews, depth) is none."""
-    if image.format in ONE_PICTURE:
-        return 1
-    try:
-        return getattr(image, "n_frames", 1)
-    except DECODER_ERRORS as error:
-        raise InputError(_unreadable(path, error)) from error
 
 
 def _unreadable(path: Path, error: Exception) -> str:

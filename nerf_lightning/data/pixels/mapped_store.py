@@ -23,6 +23,8 @@ from torch import Tensor
 
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.budgets import limits
+from nerf_lightning.files.json_files import parse_json
 from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.files.regular import AbsentError, open_own
 from nerf_lightning.messages.errors import InputError
@@ -35,8 +37,6 @@ CHECKED_WHOLE = 1 << 32
 ones, which may be more than it holds, only spots are, unless contents are to be compared."""
 PIECE = 1 << 24
 LONGEST_SIDE = 1 << 24
-MOST_HEADER_BYTES = 1 << 26
-"""A million views take less."""
 GIGABYTE = 1e9
 
 log = logging.getLogger(__name__)
@@ -136,8 +136,8 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     """Return the header of a store that is whole and up to date, else None."""
     path = base.with_suffix(".pixels")
     try:
-        with open_own(base.with_suffix(".json"), MOST_HEADER_BYTES) as file:
-            header = Header(**json.load(file))
+        with open_own(base.with_suffix(".json"), limits().json_bytes) as file:
+            header = Header(**parse_json(file.read().decode(), base))
         _require_numbers(header)
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
         if sound and (contents is not None or header.num_bytes <= CHECKED_WHOLE):

@@ -4,7 +4,6 @@ They are parsed here: COLMAP's own library hangs on some truncated ones. What a 
 to catch (`files.trust.reading`).
 """
 
-import io
 import math
 import mmap
 import os
@@ -19,7 +18,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.regular import encoding_of, open_regular
+from nerf_lightning.files.regular import encoding_of, open_regular, read_lines
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 
@@ -45,12 +44,10 @@ MODELS = {
 }
 """COLMAP's numbers of camera models, with their names and counts of parameters."""
 COUNTS = dict(MODELS.values())
-MOST_BYTES = 1 << 36
-"""Of a file; ten million points with long tracks take a tenth."""
-LONGEST_LINE = 1 << 24
-"""In characters; that of a photograph with a hundred thousand features takes less."""
+LONGEST_NAME = 1 << 14
+"""In bytes."""
 MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
-"""So many points, spread over all, say where they were seen, unless in more photographs."""
+"""Points, spread over all, whose tracks are read, up to `budgets.points` entries; photographs that a track may have."""
 CURE = "Copy the model again, or run the reconstruction again (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 
@@ -126,16 +123,18 @@ class BinaryFiles:
     def points(self, path: Path) -> ColmapPoints:
         """Return the sparse points."""
         data, found, tracks = _Bytes(path), array("d"), [np.zeros(0, "<u4")]
+        left = limits().points
         count = data.count(51, "points")
         lengths, stride = np.zeros(count, np.int64), 1 + count // MOST_TRACKS
         for number in range(count):
             _, x, y, z, _, _, _, error, length = data.take("<Q3d3BdQ")
             found.extend((x, y, z, error))
-            if number % stride or length > LONGEST_TRACK:
+            if number % stride or length > min(LONGEST_TRACK, left):
                 data.skip(8 * length)
             else:
                 tracks.append(data.numbers("<u4", 2 * length)[::2])
                 lengths[number] = length
+                left -= length
         data.end()
         return ColmapPoints.of(np.frombuffer(found, np.float64).reshape(-1, 4), np.concatenate(tracks), lengths)
 
@@ -146,7 +145,7 @@ class _Bytes:
     def __init__(self, path: Path):
         self.path, self.place = path, 0
         self.data: bytes | mmap.mmap
-        with open_regular(path, MOST_BYTES, CURE) as file:
+        with open_regular(path, "colmap", CURE) as file:
             # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
             empty = os.fstat(file.fileno()).st_size == 0
             self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -161,7 +160,7 @@ class _Bytes:
         count = int(self.take("<Q")[0])
         if count * least_bytes > len(self.data) - self.place:
             raise ValueError(f"it claims {count:,} entries, but has {len(self.data)} bytes")
-        require_within(budget, count, str(self.path), budget)
+        require_within(budget, count, self.path, budget)
         return count
 
     def numbers(self, kind: str, count: int) -> ndarray:
@@ -174,9 +173,9 @@ class _Bytes:
         self.place += size
 
     def text(self) -> str:
-        end = self.data.find(b"\0", self.place)
+        end = self.data.find(b"\0", self.place, self.place + LONGEST_NAME)
         if end < 0:
-            raise ValueError("it ends within a name")
+            raise ValueError(f"it ends within a name, or has one of more than {LONGEST_NAME:,} bytes")
         name, self.place = self.data[self.place : end], end + 1
         return name.decode("utf-8")
 
@@ -227,7 +226,8 @@ class TextFiles:
                 words = line.split(maxsplit=8 + 2 * LONGEST_TRACK)
                 x, y, z = map(float, words[1:4])
                 found.extend((x, y, z, float(words[7]) if len(words) > 7 else math.nan))
-                track = [int(image) for image in words[8 : 8 + 2 * LONGEST_TRACK : 2] if image.isdecimal()]
+                last = 8 + 2 * min(LONGEST_TRACK, limits().points - len(tracks))
+                track = [int(image) for image in words[8:last:2] if image.isdecimal()]
             tracks.extend(track)
             lengths.append(len(track))
         numbers = (np.frombuffer(each, np.int64) for each in (tracks, lengths))
@@ -236,13 +236,8 @@ class TextFiles:
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
     """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
-    with (
-        open_regular(path, MOST_BYTES, CURE) as binary,
-        io.TextIOWrapper(binary, encoding_of(binary), newline="\n") as file,
-    ):
-        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
-            if len(line) > LONGEST_LINE:
-                raise ValueError(f"line {number} has more than {LONGEST_LINE:,} characters")
+    with open_regular(path, "colmap", CURE) as file:
+        for number, line in enumerate(read_lines(file, encoding_of(file)), start=1):
             if not line.startswith("#") and (keep_empty or line.strip()):
                 yield f"{path}, line {number}", line.strip()
 
@@ -252,8 +247,5 @@ def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterat
     most = getattr(limits(), budget)
     for number, line in enumerate(lines):
         if number == most:
-            raise InputError(
-                f"{path} has more than {most:,} {budget}, the limit. If you trust it, add budgets.{budget}=N; "
-                "otherwise use another file."
-            )
+            require_within(budget, math.inf, path, budget)
         yield line

@@ -62,7 +62,7 @@ class FrameFile:
         (frames,) = keys_of(content, ("frames",), str(path), wanted_by)
         if not isinstance(frames, list):
             raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
-        require_within("views", len(frames), str(path), "views")
+        require_within("views", len(frames), path, "views")
         if content.get("from_mitsuba"):
             raise InputError(
                 f"{path} says from_mitsuba, and Mitsuba's cameras use other axes than those of Blender and nerfstudio. "

@@ -18,15 +18,13 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.regular import open_regular, read_text
-from nerf_lightning.files.trust import reading
+from nerf_lightning.files.numpy_files import read_npy
+from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
-MOST_BYTES = 1 << 28
-"""A hundred thousand views take a twentieth."""
 CURE = "Make it again with LLFF's imgs2poses, or read the COLMAP model instead (scene=colmap)."
 
 log = logging.getLogger(__name__)
@@ -117,20 +115,18 @@ def _registered(root: Path, names: list[str]) -> list[str]:
     path = root / "view_imgs.txt"
     if not path.is_file():
         return []
-    wanted = {Path(line.strip()).stem for line in read_text(path, MOST_BYTES, CURE).splitlines()}
+    wanted = {Path(line.strip()).stem for line in read_text(path, "text", CURE).splitlines()}
     return [name for name in names if Path(name).stem in wanted]
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
     """Return a row for each view: a 3 x 5 matrix (down, right, back, center; height, width, focal) and two depths."""
-    # Read by its own format: np.load would open archives too, and unpickle what is neither.
-    with reading(path, CURE), open_regular(path, MOST_BYTES, CURE) as file:
-        rows = np.lib.format.read_array(file, allow_pickle=False)
+    rows = read_npy(path, CURE)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":
         shape = " x ".join(map(str, rows.shape)) or "a single number"
         raise InputError(
             f"{path} is {shape} of {rows.dtype}, but each view needs one row of {COLUMNS} numbers: a 3 x 5 matrix and "
             f"two depths. {CURE}"
         )
-    require_within("views", len(rows), str(path), "views")
+    require_within("views", len(rows), path, "views")
     return np.asarray(rows, dtype=np.float64)

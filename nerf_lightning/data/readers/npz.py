@@ -19,9 +19,7 @@ from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import GivenFrameReader
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
-from nerf_lightning.files.numpy_files import open_archive
-from nerf_lightning.files.regular import open_regular
-from nerf_lightning.files.trust import reading
+from nerf_lightning.files.numpy_files import open_npz
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, resized
@@ -29,7 +27,6 @@ from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
 LAYOUT = "It needs images (n, height, width, 3), poses (n, 4, 4) camera-to-world and one focal length in pixels."
-ALLOW = "If you trust it, allow more with scene.max_gigabytes=N; otherwise use another file."
 CURE = f"Remove it, and copy or download it again. {LAYOUT}"
 
 
@@ -44,14 +41,12 @@ class NpzReader(GivenFrameReader):
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
         train_fraction: with `hold_every` 0, the share of the views, from the first on, used for training.
         download: where to download a missing file: `url`, `bytes` and `sha256` (None: only its size is checked).
-        max_gigabytes: the maximum unpacked size; a small file can be made to fill the memory.
     """
 
     path: str
     hold_every: int = 0
     train_fraction: float = 0.8
     download: Mapping[str, Any] | None = None
-    max_gigabytes: float = 2.0
     name: str = field(default="npz", kw_only=True)
 
     def read(self) -> Scene:
@@ -66,7 +61,7 @@ class NpzReader(GivenFrameReader):
         path = Path(self.path)
         if self.download and not path.exists():
             fetch(self.download["url"], path, self.download["bytes"], self.download["sha256"])
-        images, poses, focal = _load(path, self.max_gigabytes)
+        images, poses, focal = _load(path)
         count, height, width, _ = images.shape
         self.check_divisible(width, height)
         left_out, views = LeftOut(str(path)), []
@@ -104,19 +99,15 @@ class NpzReader(GivenFrameReader):
         )
 
 
-def _load(path: Path, max_gigabytes: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _load(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Return images, poses and the focal length; nothing in the file is executed (no pickles)."""
-    with (
-        reading(path, CURE),
-        open_regular(path, None) as file,
-        open_archive(file, path, 1e9 * max_gigabytes, ALLOW) as archive,
-    ):
+    with open_npz(path, CURE) as archive:
         if missing := [key for key in KEYS if key not in archive]:
             raise InputError(f"{path} lacks {listed(missing)}; it has {listed(archive) or 'nothing'}. {LAYOUT}")
         images, poses, focal = (np.asarray(archive[key]) for key in KEYS)
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise InputError(f"{path}: images has the shape {images.shape}. {LAYOUT}")
-    require_within("views", len(images), str(path), "views")
+    require_within("views", len(images), path, "views")
     if images.dtype != np.uint8 and images.dtype.kind != "f":
         raise InputError(
             f"{path}: images has the type {images.dtype}, but it must be floating point in 0..1, or uint8."

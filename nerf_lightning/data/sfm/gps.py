@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
-from nerf_lightning.data.pixels.formats import decoders
-from nerf_lightning.data.pixels.images import DECODER_ERRORS, open_picture
+from nerf_lightning.data.pixels.images import DECODER_ERRORS, opened_picture
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Radius of the earth in meters, and by how much it is less at the poles (WGS 84)."""
@@ -28,7 +27,7 @@ log = logging.getLogger(__name__)
 def gps_of(path: Path) -> tuple[float, float, float] | None:
     """Return latitude and longitude in degrees, and meters above the sea; None where a photograph does not say."""
     try:
-        with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
+        with opened_picture(path) as image:
             said: Mapping[int, Any] = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
         place = [_degrees(said, key, negative) for key, negative in ((2, "S"), (4, "W"))]
         height = float(said.get(6, 0.0)) * (-1 if said.get(5) in (1, b"\x01") else 1)

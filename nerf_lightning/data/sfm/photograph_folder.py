@@ -15,7 +15,7 @@ from nerf_lightning.data.pixels.images import (
     ORIENTATION,
     QUARTER_TURNS,
     image_size,
-    open_picture,
+    opened_picture,
     read_rgba,
 )
 from nerf_lightning.files.budgets import require_within
@@ -167,7 +167,7 @@ def _photograph(path: Path) -> FoundPhotograph:
 
 def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...], bool]:
     """Return how a photograph is turned, whether it is a panorama, what tells its lens apart, and if it has alpha."""
-    with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
+    with opened_picture(path) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
             exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
@@ -184,7 +184,7 @@ def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...], bool]:
 
 def _write_anew(path: Path, target: Path) -> None:
     try:
-        with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
+        with opened_picture(path) as image:
             upright = ImageOps.exif_transpose(image)
             profile = image.info.get("icc_profile")
     except DECODER_ERRORS as error:

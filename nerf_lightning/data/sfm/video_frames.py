@@ -1,6 +1,9 @@
 """Sharp frames of a video: of every few consecutive frames the one that is blurred least. Only videos are opened."""
 
 import logging
+import math
+import re
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageFilter
 
 from nerf_lightning.data.sfm.hdr_films import hdr_transfer, tone_mapped
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
@@ -22,6 +26,8 @@ JPEG_QUALITY = 95
 BLURRED = 0.7
 # Nothing but the file itself is opened.
 INPUT = ["-protocol_whitelist", "file"]
+COPIED = re.compile(rb"Output #0.*?Video: .*?, (\d+)x(\d+).*\bframe= *(\d+)", re.DOTALL)
+"""Of what ffmpeg says: width and height of the stream, and how many frames it has copied."""
 # Else frames are repeated where they come at uneven times, as phones film.
 EACH_ONCE = ["-fps_mode", "passthrough"]
 
@@ -67,11 +73,18 @@ def count_frames(path: Path) -> int:
     import imageio_ffmpeg
 
     require_video(path)
-    try:
-        count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
-    except RuntimeError as error:
-        raise InputError(_not_a_video(path)) from error
-    return int(count)
+    most = limits().video_frames
+    # Packets are copied: decoding them would take as long as the film, and small ones can be of any size.
+    copied = ("-map", "0:v:0", "-map_metadata", "-1", "-c", "copy", "-frames:v", str(most + 1), "-f", "null", "-")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *INPUT, "-i", str(path), *copied]
+    result = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    said = COPIED.search(result.stderr)
+    if result.returncode or said is None:
+        raise InputError(_not_a_video(path))
+    width, height, count = map(int, said.groups())
+    require_within("megapixels", math.ceil(width * height / 1e6), path, "megapixels in each frame")
+    require_within("video_frames", math.inf if count > most else count, path, "frames")
+    return count
 
 
 def frame_stride(num_frames: int, every: int | None) -> int:
@@ -150,8 +163,7 @@ SYNC = 0x47
 
 def require_video(path: Path) -> None:
     """Refuse what is no container of video, and say what is read."""
-    # However large: a few frames of it are in memory at a time.
-    with open_regular(path, None) as file:
+    with open_regular(path, "video") as file:
         start = file.read(600)
     known = start.startswith(STARTS) or start[4:8] in BOXES
     riff = start[:4] == b"RIFF" and start[8:12] == b"AVI "

@@ -5,7 +5,6 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import torch
@@ -18,9 +17,9 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.regular import open_regular, read_text
-from nerf_lightning.files.trust import reading
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.xml_files import read_xml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
@@ -71,13 +70,10 @@ class MetashapeReader(CaptureReader):
         """Return the aligned photographs, in the file's order."""
         root = self.folder()
         path = self._path(root)
-        text = read_text(path, limits().json_bytes, CURE)
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise InputError(f"{path} declares XML entities, which files of Metashape never do. {CURE}")
-        chunk = _chunk(text, path)
+        chunk = _chunk(path)
         left_out = LeftOut(str(path))
         cameras = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("label")]
-        require_within("views", len(cameras), str(path), "views")
+        require_within("views", len(cameras), path, "views")
         aligned = [camera for camera in cameras if camera.findtext("transform") and camera.get("enabled") not in OFF]
         labels = [str(camera.get("label")) for camera in cameras]
         pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
@@ -122,11 +118,9 @@ def _is_ours(path: Path) -> bool:
     return b"<document" in start and b"<chunk" in start
 
 
-def _chunk(text: str, path: Path) -> Element:
+def _chunk(path: Path) -> Element:
     """Return the first chunk that has aligned cameras, or else the first with cameras."""
-    with reading(path, CURE):
-        document = ElementTree.fromstring(text)
-    chunks = [chunk for chunk in document.iterfind("chunk") if chunk.find("cameras//camera") is not None]
+    chunks = [chunk for chunk in read_xml(path, CURE).iterfind("chunk") if chunk.find("cameras//camera") is not None]
     if not chunks:
         raise InputError(f"{path} holds no chunk of cameras. {CURE}")
     aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None] or chunks

@@ -18,15 +18,12 @@ from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.numpy_files import open_archive
-from nerf_lightning.files.regular import open_regular
-from nerf_lightning.files.trust import reading
+from nerf_lightning.files.numpy_files import open_npz
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
-MOST_BYTES = 1 << 28
 CURE = "Copy the file again."
 
 log = logging.getLogger(__name__)
@@ -78,14 +75,10 @@ class NeusReader(CaptureReader):
 
 def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
     """Return the world and the scale matrices by their numbers."""
-    with (
-        reading(path, CURE),
-        open_regular(path, MOST_BYTES, CURE) as file,
-        open_archive(file, path, MOST_BYTES, CURE) as archive,
-    ):
+    with open_npz(path, CURE) as archive:
         found: dict[str, dict[int, ndarray]] = {"world": {}, "scale": {}}
         wanted = [match for key in archive if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
-        require_within("views", len(wanted) // 2, str(path), "views")
+        require_within("views", len(wanted) // 2, path, "views")
         for match in wanted:
             if np.shape(matrix := archive[match[0]]) == (4, 4):
                 found[match[1]][int(match[2])] = np.asarray(matrix, np.float64)

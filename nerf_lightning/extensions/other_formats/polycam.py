@@ -41,7 +41,7 @@ class PolycamReader(CaptureReader):
         cameras, pictures = _folders_in(self.folder()) or (keyframes / FOLDERS[-1][0], keyframes / FOLDERS[-1][1])
         files = pictures_by_stem(pictures)
         poses = sorted(cameras.glob("[!.]*.json"))
-        require_within("views", len(poses), str(cameras), "views")
+        require_within("views", len(poses), cameras, "views")
         left_out, views = LeftOut(str(cameras)), []
         for path in poses:
             with left_out.unless_usable(path.stem):

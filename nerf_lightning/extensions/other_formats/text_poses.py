@@ -23,7 +23,6 @@ from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import flip_yz
 
-MOST_BYTES = 1 << 16
 CURE = "Copy it again."
 NSVF_SPLITS = {"0": "train", "1": "val", "2": "test"}
 """By the first character of a picture's name, as in 0_train_0001.png."""
@@ -85,7 +84,7 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
     """Return the views of a folder with `pose/`, photographs, and intrinsics for each or for all."""
     place = first_with_pictures(folder, [name for name in PICTURE_FOLDERS if name])
     pictures = {} if place is None else pictures_by_stem(place)
-    require_within("views", len(pictures), str(folder), "views")
+    require_within("views", len(pictures), folder, "views")
     for pose in sorted((folder / "pose").glob("[!.]*.txt")):
         with left_out.unless_usable(prefix + pose.stem):
             if pose.stem not in pictures:
@@ -129,7 +128,7 @@ def _intrinsics(
 def _numbers(path: Path) -> list[float]:
     """Return the numbers at the beginning of a text file."""
     found = list[float]()
-    lines = [line for line in read_text(path, MOST_BYTES, CURE).splitlines() if not line.startswith("#")]
+    lines = [line for line in read_text(path, "text", CURE).splitlines() if not line.startswith("#")]
     for word in " ".join(lines).replace(",", " ").split():
         try:
             found.append(float(word))

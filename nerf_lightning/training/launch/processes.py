@@ -4,7 +4,6 @@ Lightning would start the others by repeating the command line, which starts swe
 starts `python -m nerf_lightning.cli.worker` on the config that this process has composed.
 """
 
-import json
 import logging
 import os
 import signal
@@ -31,6 +30,7 @@ from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.compute.settings import Launcher, cluster_environment
 from nerf_lightning.compute.slurm import num_tasks
 from nerf_lightning.config.instantiate import require_fitting_values
+from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError
 
 # What of Hydra's own config a worker may ask for.
@@ -161,7 +161,7 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
             raise SystemExit(_exit_code([failure.exitcode for failure in error.failures.values()])) from None
         except SignalException as stopped:
             raise SystemExit(128 + stopped.sigval) from None
-        return json.loads((Path(folder) / "result.json").read_text())
+        return read_json(Path(folder) / "result.json")
 
 
 def end_with(launcher: int) -> None:

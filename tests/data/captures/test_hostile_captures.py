@@ -112,7 +112,7 @@ def test_a_focal_length_that_is_possible_for_another_picture_alone(tmp_path, tim
 def test_points_of_a_text_are_counted_too(tmp_path):
     root = WRITERS["text"](tmp_path / "capture")
     with budget(points=50):
-        refused(read, "colmap", root, parts=("points3D.txt has more than 50 points", "add budgets.points=N"))
+        refused(read, "colmap", root, parts=("more points than the limit of 50", "add budgets.points=100"))
     with budget(points=60):
         assert len(read("colmap", root).points) == 60
 
@@ -207,7 +207,7 @@ def test_a_jpeg_of_fewer_bits_than_blocks_was_cut_short(tmp_path):
 def test_a_json_of_brackets_is_refused_before_they_fill_the_memory(tmp_path, unit):
     path = tmp_path / "transforms.json"
     path.write_text(f"[{unit * 3_000_000}0]")
-    with pytest.raises(InputError, match=r"has 3,000,001 lists and objects, .* add budgets\.json_lists=3000001"):
+    with pytest.raises(InputError, match=r"has [69],000,001 separators .* add budgets\.json_values=[69]000001"):
         read_json(path)
 
 
@@ -239,7 +239,7 @@ def test_ten_million_cameras_in_other_files(tmp_path):
     with budget(views=8):
         malformed.refused("transforms", WRITERS["transforms"](tmp_path / "transforms"), r"transforms\.json has 9 views")
         malformed.refused("llff", WRITERS["llff"](tmp_path / "nine"), r"poses_bounds\.npy has 9 views")
-        malformed.refused("text", WRITERS["text"](tmp_path / "text"), r"cameras\.txt has more than 8 views")
+        malformed.refused("text", WRITERS["text"](tmp_path / "text"), r"cameras\.txt has more views than .* of 8")
         write_blender(tmp_path / "blender", {"train": 9, "val": 1, "test": 1})
         with pytest.raises(InputError, match=r"transforms_train\.json has 9 views"):
             BlenderReader(str(tmp_path / "blender")).read()

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.budget import budget
 from support.captures import npz_content, write_blender, write_npz
 from support.malformed import MODEL, WRITERS, edit_bytes, edit_frame
 from support.planted import Payload, peak_of
@@ -178,11 +179,10 @@ def test_pickles_in_arrays(tmp_path):
 
 def test_what_an_archive_may_unpack_to_is_a_setting(tmp_path):
     path = write_npz(tmp_path / "a.npz")
-    with pytest.raises(
-        InputError, match=r"a.npz .* unpacks to 0.00 GB, and 1e-06 GB are allowed.*scene.max_gigabytes=N"
-    ):
-        NpzReader(str(path), max_gigabytes=1e-6).read()
-    assert NpzReader(str(path), max_gigabytes=1e-3).read().view_names
+    for most in ({"npz_arrays": 2}, {"npz_bytes": 1000}):
+        with budget(**most), pytest.raises(InputError, match=rf"a.npz has .* the limit .* budgets.{next(iter(most))}="):
+            NpzReader(str(path)).read()
+    assert NpzReader(str(path)).read().view_names
 
 
 def npy(shape, dtype="<f4"):
@@ -215,7 +215,7 @@ def bombs(tmp_path):
     """Small files that ask for much memory: the arguments of `read`, and words of the refusal."""
     zip_bomb(tmp_path / "large.npz", npy((100, 1024, 1024, 1), "|u1"), 100 * MEGABYTE)
     zip_bomb(tmp_path / "lying.npz", npy((10**6, 800, 800, 3)), 10 * MEGABYTE)
-    yield "npz", tmp_path / "large.npz", "unpacks to 0.10 GB"
+    yield "npz", tmp_path / "large.npz", "bytes once it is unpacked"
     yield "npz", tmp_path / "lying.npz", "cannot be read"
     root = WRITERS["llff"](tmp_path / "llff")
     (root / "poses_bounds.npy").write_bytes(npy((10**10, 17)) + bytes(136))
@@ -223,12 +223,12 @@ def bombs(tmp_path):
     for side in (60_000, 2**31 - 1):
         root = WRITERS["colmap"](tmp_path / f"png{side}")
         (root / "images" / "p_3.png").write_bytes(png(side, side))
-        yield "colmap", root, "more than 178 megapixels|cannot be read"
+        yield "colmap", root, "more megapixels than the limit of 178|cannot be read"
     root = WRITERS["colmap"](tmp_path / "tiff")
     tags = [(256, 60_000), (257, 60_000), (258, 8), (259, 1), (262, 1), (273, 8), (278, 60_000), (279, 10)]
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
     (root / "images" / "p_3.png").write_bytes(b"II*\0\x08\0\0\0" + struct.pack("<H", len(tags)) + entries + bytes(4))
-    yield "colmap", root, "more than 178 megapixels"
+    yield "colmap", root, "more megapixels than the limit of 178"
     for name, most in (("cameras", 2**63), ("images", 10**12), ("points3D", 10**12)):
         root = WRITERS["colmap"](tmp_path / name)
         path = root / MODEL / f"{name}.bin"
@@ -265,12 +265,14 @@ sys.path.insert(0, "tests")
 from support.posed_captures import read
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.files.budgets import Budgets, set_limits
+set_limits(Budgets(npz_bytes=100_000_000))
 kinds, good = json.load(open(sys.argv[1])), sys.argv[2]
 read("colmap", Path(good))
 # begin
 for kind, place, words in kinds:
     try:
-        read_whole = NpzReader(place, max_gigabytes=0.1).read() if kind == "npz" else read(kind, Path(place))
+        read_whole = NpzReader(place).read() if kind == "npz" else read(kind, Path(place))
         if len(read_whole.view_names) != 8 or "megapixels" not in words:
             print(place, "was read")
     except InputError as error:

@@ -125,9 +125,9 @@ SEVERAL = {"save_all": True, "append_images": RGB[1:]}
 REFUSED = [
     ("a.tif", saved(Image.fromarray(np.full((2, 2), 0.5, np.float32)), "a.tif"), r"pixel mode 'F'.* 8-bit RGB"),
     ("a.jpg", saved(Image.new("CMYK", (4, 4)), "a.jpg"), r"has CMYK colors.* `magick a.jpg -colorspace sRGB a.png`"),
-    ("a.webp", saved(RGB[0], "a.webp", **SEVERAL), r"holds 3 pictures.* Save each as a file of its own"),
-    ("a.png", saved(RGB[0], "a.png", **SEVERAL), r"holds 3 pictures"),
-    ("a.tiff", saved(RGB[0], "a.tiff", **SEVERAL), r"holds 3 pictures"),
+    ("a.webp", saved(RGB[0], "a.webp", **SEVERAL), r"holds several pictures.* Save each as a file of its own"),
+    ("a.png", saved(RGB[0], "a.png", **SEVERAL), r"holds several pictures"),
+    ("a.tiff", saved(RGB[0], "a.tiff", **SEVERAL), r"holds several pictures"),
     # Of a format that starts another program.
     ("a.eps", saved(RGB[0], "a.eps"), r"is not an image that can be read"),
     ("b.png", lambda folder: (folder / "b.png").write_bytes(png_16_bit([])), r"is not an image that can be read"),
@@ -220,18 +220,21 @@ def test_a_picture_is_read_as_it_is_stored_or_upright(tmp_path, ending):
 def test_refuses_decompression_bombs(tmp_path):
     Image.new("1", (1200, 1000)).save(tmp_path / "a.png")
     assert image_size(tmp_path / "a.png") == (1200, 1000)
-    with budget(megapixels=1), pytest.raises(InputError, match=r"claims more than 1 megapixels; .*budgets.megapix"):
+    with (
+        budget(megapixels=1),
+        pytest.raises(InputError, match=r"more megapixels than the limit of 1\. .*budgets.megap"),
+    ):
         image_size(tmp_path / "a.png")
 
 
-def test_a_page_without_a_size_is_damage(tmp_path):
+def test_of_the_pages_of_a_tiff_the_first_alone_is_read(tmp_path):
     Image.fromarray(picture(0)[..., :3]).save(tmp_path / "a.tif")
     content = (tmp_path / "a.tif").read_bytes()
     (first,) = struct.unpack_from("<I", content, 4)
     (tags,) = struct.unpack_from("<H", content, first)
     end = first + 2 + 12 * tags
     (tmp_path / "a.tif").write_bytes(content[:end] + struct.pack("<I", len(content)) + content[end + 4 :] + bytes(6))
-    with pytest.raises(InputError, match=r"a.tif cannot be read: Missing dimensions. It is damaged"):
+    with pytest.raises(InputError, match=r"a.tif holds several pictures"):
         image_size(tmp_path / "a.tif")
 
 
@@ -241,7 +244,7 @@ def test_large_pictures_are_decoded_one_at_a_time(tmp_path, monkeypatch):
         monkeypatch.setattr(images, "LARGE", least)
         read = threading.Event()
         other = threading.Thread(target=lambda read=read: (images.read_rgba(tmp_path / "a.png"), read.set()))
-        with images._opened(tmp_path / "a.png"):
+        with images.opened_picture(tmp_path / "a.png"):
             other.start()
             assert read.wait(timeout=0.3 if waits else 30) is not waits
         other.join()
