@@ -174,11 +174,15 @@ class ScratchFolder:
                 "another folder with paths.output_dir=DIR."
             ) from error
 
+    def release(self) -> None:
+        """Let others have it, with what is in it."""
+        self.lock.release()
+
     def remove(self) -> None:
         """Remove it, as far as that can be, while it is held: the lock's file last, since then others may come."""
         with suppress(OSError):
             empty_ours(self.path)
             (self.path / MARK).unlink()
             (self.path / LOCK).unlink()
-        self.lock.release()
+        self.release()
         remove_empty(self.path)

@@ -99,7 +99,7 @@ class FilmFrames:
 
     def close(self) -> None:
         """Let others have the folder; the frames stay."""
-        self.scratch.lock.release()
+        self.scratch.release()
 
     def results(self) -> list[Path]:
         """Return the files, or the folders of frames."""

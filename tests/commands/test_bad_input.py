@@ -121,7 +121,7 @@ def test_no_ffmpeg_or_no_such_background_for_a_render(nerf, last, tmp_path, monk
 
 
 def test_lpips_without_its_weights(nerf, last, tmp_path):
-    said(nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "no such file", "alexnet")
+    said(nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "does not exist", "alexnet")
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ def test_pycolmap_absent_is_said_with_the_cure(poses, photographs, tmp_path, mon
         (["images=a", "num_features=0"], "num_features=0: give 1 or more"),
         (["images=[1]"], "images=[1] is not valid: it must be a path"),
         (["images=nowhere"], "images=nowhere is not a folder that can be read (No such file or directory)"),
-        (["video=nowhere.mp4"], "video=nowhere.mp4: there is no such file"),
+        (["video=nowhere.mp4"], "nowhere.mp4 does not exist; the folder holds"),
     ],
 )
 def test_bad_settings_are_named(poses, tmp_path, settings, fragment):

@@ -244,13 +244,13 @@ def test_what_nerf_eval_measured_can_be_taken_instead(table, tmp_path):
 
 
 def test_nothing_to_show_is_said(nerf, table, tmp_path, monkeypatch):
-    said(nerf("table", tmp_path / "nowhere"), "nowhere", "no such folder")
+    said(nerf("table", tmp_path / "nowhere"), "nowhere", "does not exist")
     (tmp_path / "runs").mkdir()
     said(table()[0], "no run in")
     leave_measured_run(tmp_path / "runs" / "a", None)
     said(table()[0], "None of the 1 runs has a PSNR in metrics.json")
     monkeypatch.chdir(tmp_path)
-    said(nerf("table"), "runs=outputs: there is no such folder")
+    said(nerf("table"), "runs=outputs: outputs does not exist")
 
 
 def test_pictures_of_several_sizes_are_counted(table, tmp_path):

@@ -73,7 +73,7 @@ def test_too_small_a_picture_has_no_score(lpips):
 def test_a_missing_file_says_how_to_get_it_and_a_wrong_one_is_named(tmp_path):
     with pytest.raises(InputError) as caught:
         load_lpips(str(tmp_path / "alexnet.pth"))
-    assert "there is no such file" in str(caught.value)
+    assert "does not exist" in str(caught.value)
     assert LPIPS_HINT in str(caught.value)
     path = tmp_path / "weights.pth"
     wrong = torchvision_like(ALEXNET)

@@ -105,7 +105,7 @@ def test_a_scratch_folder_is_held_by_one_and_vanishes(tmp_path):
     one.hold()
     (one.path / "half").touch()
     refused(other.hold, parts=(f"{tmp_path}/out is in use by another process that works there",))
-    one.lock.release()
+    one.release()
     other.hold()
     assert (other.path / "half").exists()
     other.remove()

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path, PureWindowsPath
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from support.running import refused
@@ -79,6 +79,7 @@ def test_nothing_is_reached_through_a_link(tmp_path):
     refused(lambda: child_of(tmp_path, "a/b", ending=".png"), parts=("a_b.png is a symbolic link to elsewhere",))
 
 
+@settings(deadline=None)  # the first call imports Hydra
 @given(VALUES.filter(lambda value: max(value, default="a") < "\ud800"))
 def test_the_folder_of_a_job_is_a_child_of_its_sweep_whatever_is_swept(value):
     for typed in ((), ("hydra.sweep.subdir='${scene.name}/../${seed}'",)):

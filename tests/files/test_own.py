@@ -103,7 +103,7 @@ def test_bricks_in_a_folder_of_others_are_neither_read_nor_kept(tmp_path, caplog
     cache.chmod(0o777)
     assert torch.equal(bricks(cache), first)
     assert path.read_bytes() == b"planted"
-    assert f"The folder {cache} can be written by others (mode 0777)" in caplog.text
+    assert f"{cache} can be written by others (mode 0777)" in caplog.text
 
 
 def test_kept_photographs_are_the_users_own(tmp_path, umask, caplog):

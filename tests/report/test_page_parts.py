@@ -38,7 +38,7 @@ def test_nothing_of_a_file_but_its_pixels_comes_into_a_page(tmp_path):
 
 def test_what_is_no_film_is_refused(tmp_path):
     path = tmp_path / "a.mp4"
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         embedded_video(path, 100)
     path.write_bytes(b"<html>")
     with pytest.raises(InputError, match="not an mp4"):
