@@ -115,7 +115,9 @@ def test_impossible_cooldowns_are_refused(arguments):
         Cooldown(**arguments)
 
 
-@pytest.mark.parametrize("settings", [{"lr": math.nan}, {"eps": math.inf}, {"weight_decay": -1}, {"betas": (0.9, 1.0)}])
+@pytest.mark.parametrize(
+    "settings", [{"lr": math.nan}, {"eps": math.inf}, {"weight_decay": -1.0}, {"betas": (0.9, 1.0)}]
+)
 def test_numbers_out_of_range_are_refused(settings):
     with pytest.raises(InputError, match="give a positive lr"):
         TableAdam([torch.nn.Parameter(torch.ones(1))], **settings)

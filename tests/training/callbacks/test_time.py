@@ -125,7 +125,7 @@ def test_a_schedule_is_fitted_only_once_time_was_measured(monkeypatch):
         assert budget.used == used
 
 
-@pytest.mark.parametrize("seconds", [0, float("nan"), float("inf")])
+@pytest.mark.parametrize("seconds", [0.0, float("nan"), float("inf")])
 def test_a_budget_that_is_no_time_is_refused(seconds):
     with pytest.raises(InputError, match=f"budget.seconds={seconds}: give a positive time"):
         TimeBudget(seconds)
