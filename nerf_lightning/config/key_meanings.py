@@ -1,12 +1,9 @@
 """What settings mean, by group: one table, asked by whoever treats settings differently.
 
-Is a run of another value another run? Has a finished one of another value something left to do? Does what is learned
-depend on it? Has it a column in a table of runs? And may a file choose it that comes from anybody, such as the saved
-overrides of a run folder or the scene that a checkpoint recorded? A group that is not in the table is trusted to nobody
-but the person at the command line; a new reader, field, loss or callback has the row of its group.
-
-`x.*` is each key that stands in the section x, and `x.**` is x and whatever lies below it. The most precise entry
-holds: a setting of a trusted group that says where to write, what to fetch or how far to trust needs one of its own.
+A group that is not in the table is trusted to nobody but the person at the command line; a new reader, field, loss or
+callback has the row of its group. `x.*` is each key that stands in the section x, and `x.**` is x and whatever lies
+below it. The most precise entry holds: a setting of a trusted group that says where to write, what to fetch or how far
+to trust needs one of its own.
 """
 
 import hashlib
@@ -25,20 +22,13 @@ LEADS_OUT = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.([/\\]|\Z)")
 class Trust(Enum):
     """What is taken of a setting from a file that may come from anybody: finite numbers, switches, null, some texts."""
 
-    PLAIN = auto()
-    """Texts that look nothing up, and paths that stay below the folder from where they are meant."""
-    WORDS = auto()
-    """Single words: a path or an address is none."""
-    NUMBERS = auto()
-    """No texts."""
-    PLACE = auto()
-    """Paths of the capture, wherever it lies."""
-    IF_THERE = auto()
-    """As PLACE, but only of what exists: some scenes put there what they fetch."""
-    ONE_START = auto()
-    """Nothing: it belonged to one start of a run, and the next one has its own."""
-    NOTHING = auto()
-    """Nothing: a file that holds it is refused, or it is passed over where the file need not be believed."""
+    PLAIN = auto()  # texts that look nothing up, and paths that stay below the folder from where they are meant
+    WORDS = auto()  # single words: a path or an address is none
+    NUMBERS = auto()  # no texts
+    PLACE = auto()  # paths of the capture, wherever it lies
+    IF_THERE = auto()  # as PLACE, but only of what exists: some scenes put there what they fetch
+    ONE_START = auto()  # nothing: it belonged to one start of a run, and the next one has its own
+    NOTHING = auto()  # nothing: a file that holds it is refused, or it is passed over where that is no danger
 
     def takes(self, value: Any) -> bool:
         """Return whether a value is taken; a list or a section as a whole is not."""
@@ -119,8 +109,8 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
 )
 
 CHOSEN_GROUPS = (
-    *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment"),
-    *("field", "loss", "model", "optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
+    *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment", "field", "loss", "model"),
+    *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
 """Groups of conf/ of which a file may choose an option by its name. No loggers: they send pictures to accounts."""
 SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")

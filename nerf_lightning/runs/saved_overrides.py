@@ -108,12 +108,10 @@ def _is_harmless(override: Override, of_sweep: bool) -> bool:
     if package and not (key in OPTIONS and KEY.fullmatch(package) and meaning_of(package) is PART):
         return False
     values = [override.value()]
-    if override.value_type == ValueType.GLOB_CHOICE_SWEEP:
-        values = ["any"]  # stands for the names of our own options
-    elif override.is_choice_sweep():
+    if override.value_type in (ValueType.CHOICE_SWEEP, ValueType.SIMPLE_CHOICE_SWEEP):
         values = [parse(f"key={value}").value() for value in override.sweep_string_iterator()]
-    elif override.is_sweep_override():
-        values = [0]  # stands for all numbers of a range or an interval
+    elif override.is_sweep_override():  # a name that stands for those of our own options, or a number for a range
+        values = ["any" if override.is_choice_sweep() else 0]
     return all(_is_taken(key, value) for value in values)
 
 

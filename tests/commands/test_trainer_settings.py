@@ -63,10 +63,10 @@ def test_the_length_is_the_smaller_of_steps_and_epochs():
     assert TrainerSettings(max_epochs=2).num_steps(995, 10, 30) == 229  # the crop is no epoch
 
 
-def test_no_steps_at_all_are_refused():
-    for name in ("max_steps", "val_every_steps"):
-        with pytest.raises(InputError, match=f"trainer.{name}=0"):
-            TrainerSettings(**{name: 0})
+def test_no_steps_at_all_and_norms_that_are_none_are_refused():
+    for name, value in (("max_steps", 0), ("val_every_steps", 0), ("clip_norm", -1), ("clip_norm", float("nan"))):
+        with pytest.raises(InputError, match=f"trainer.{name}={value}"):
+            TrainerSettings(**{name: value})
 
 
 def test_tiles_can_be_chosen_and_switched_off():

@@ -35,7 +35,8 @@ class TableAdam(Optimizer):
         eps: float = 1e-15,
         weight_decay: float = 0.0,
     ):
-        if lr <= 0 or eps <= 0 or weight_decay < 0 or not all(0 <= beta < 1 for beta in betas):
+        in_range = 0 < lr < math.inf and 0 < eps < math.inf and 0 <= weight_decay < math.inf
+        if not in_range or not all(0 <= beta < 1 for beta in betas):
             raise InputError(
                 f"optimizer: lr={lr}, betas={list(betas)}, eps={eps}, weight_decay={weight_decay}: give a positive lr "
                 "and eps, betas from 0 to below 1, and no negative weight_decay."

@@ -1,5 +1,6 @@
 """Train the best that a given time allows: the schedule follows the measured speed, and ends with the time."""
 
+import math
 import signal
 import time
 from dataclasses import asdict, dataclass
@@ -39,7 +40,7 @@ class TimeBudget(Callback):
     STATE: ClassVar = Used
 
     def __init__(self, seconds: float, every_steps: int = 10):
-        if seconds <= 0:
+        if not 0 < seconds < math.inf:
             raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
         self.seconds, self.every_steps = seconds, every_steps
         self.used, self.first, self.since, self.compiles = 0.0, 0, 0.0, True

@@ -1,5 +1,6 @@
 """How and for how long to train, and Lightning's Trainer made from it."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -75,6 +76,8 @@ class TrainerSettings(ComputeSettings):
             raise InputError(
                 f"trainer.max_epochs={max_epochs}: give a positive number up to {MOST_EPOCHS}, or null for no bound."
             )
+        if clip_norm is not None and not 0 < clip_norm < math.inf:
+            raise InputError(f"trainer.clip_norm={clip_norm}: give a positive norm, or null for no clipping.")
         super().__init__(accelerator, precision, tile_points, num_threads, devices)
         self.max_steps, self.max_epochs = max_steps, max_epochs
         self.lightning = passed_through(lightning)

@@ -1,9 +1,11 @@
 import copy
 import itertools
+import math
 
 import pytest
 import torch
 
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.adam.step import adam_step, adam_step_torch
 from nerf_lightning.nerf.optimizers.schedule import Cooldown, ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
@@ -111,3 +113,11 @@ def test_a_longer_run_stretches_the_schedule_and_the_rise_while_warming_up_is_th
 def test_impossible_cooldowns_are_refused(arguments):
     with pytest.raises(ValueError, match="cooldown must be above 0"):
         Cooldown(**arguments)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"lr": math.nan}, {"eps": math.inf}, {"weight_decay": -1.0}, {"betas": (0.9, 1.0)}]
+)
+def test_numbers_out_of_range_are_refused(settings):
+    with pytest.raises(InputError, match="give a positive lr"):
+        TableAdam([torch.nn.Parameter(torch.ones(1))], **settings)

@@ -12,6 +12,7 @@ from filelock import FileLock
 from lightning.pytorch import Trainer
 
 from nerf_lightning.commands.train_job.live_view import Clocked
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import folder as folders
 from nerf_lightning.runs.folder import RunFolder
 from nerf_lightning.training.callbacks import training_time
@@ -122,3 +123,9 @@ def test_a_schedule_is_fitted_only_once_time_was_measured(monkeypatch):
         now[0] += 2.0
         budget.on_train_batch_end(trainer(), system, None, None, 0)
         assert budget.used == used
+
+
+@pytest.mark.parametrize("seconds", [0.0, float("nan"), float("inf")])
+def test_a_budget_that_is_no_time_is_refused(seconds):
+    with pytest.raises(InputError, match=f"budget.seconds={seconds}: give a positive time"):
+        TimeBudget(seconds)
