@@ -41,9 +41,9 @@ def caught(read):  # as the reader of captures does
 
 READERS = {
     ".json": read_json, ".xml": lambda path: read_xml(path, ""), ".yaml": read_plain_yaml, ".ply": read_ply_points,
-    ".npy": lambda path: read_npy(path, ""), ".npz": read_npz, ".bin": caught(BinaryFiles().points), ".pt": load_tensors,
-    ".points": caught(TextFiles().points), ".txt": lambda path: _registered(path.parent, []), ".gif": count_frames,
-    ".events": lambda path: read_curves(path.parent),
+    ".npy": lambda path: read_npy(path, ""), ".npz": read_npz, ".pt": load_tensors,
+    ".bin": caught(BinaryFiles().points), ".points": caught(TextFiles().points), ".gif": count_frames,
+    ".txt": lambda path: _registered(path.parent, []), ".events": lambda path: read_curves(path.parent),
 }
 warnings.simplefilter("ignore")
 size = 1024 * int(Path("/proc/self/status").read_text().split("VmSize:")[1].split()[0])
@@ -110,7 +110,7 @@ def zip_end(size):
 
 # By the name of the case: the file's ending, its first bytes, where it ends if it is sparse, and its last bytes.
 CASES = {
-    "keys of a json": (".json", b'{"a":' + b'1,"b":' * 3_000_000 + b"1}"),
+    "keys of a json": (".json", b'{"":0' + b"".join(b',"%x":1' % number for number in range(3_000_000)) + b"}"),
     "depth of a json": (".json", b'{"a":' * 500_000),
     "brackets of a json": (".json", b"[" + b"[]," * 1_900_000 + b"[]]"),
     "elements of an xml": (".xml", b"<a>" + b"<b/>" * 4_000_000 + b"</a>"),
@@ -127,7 +127,7 @@ CASES = {
     "a line of colmap": (".points", b"1 ", 20_000_000_000),
     "size of a png": (".png", png(60_000)),
     "segments of a jpeg": (".jpg", jpeg_of_segments()),
-    "pages of a tiff": (".tif", tiff_of_pages(8000)),
+    "pages of a tiff": (".tif", tiff_of_pages(30_000)),
     "frames of a video": (".gif", gif(800, 4000)),
     "size of a video": (".gif", gif(3, 15_000)),
     "values of events": (".events", b"\n" * 2_000_000),
