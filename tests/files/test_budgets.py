@@ -1,10 +1,13 @@
 """What a file may cost: one table, raised by the command line alone."""
 
+import math
+import re
 from dataclasses import asdict
 
 import pytest
 from omegaconf import OmegaConf
 from support.configs import composed, loaded
+from support.running import REPOSITORY
 
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, limits, require_within, set_limits
@@ -21,6 +24,11 @@ def test_the_yaml_has_the_table_that_the_code_has():
     assert OmegaConf.to_container(loaded("budgets", "default")) == asdict(Budgets())
 
 
+def test_the_page_on_security_has_it_too():
+    rows = re.findall(r"`(\w+)` ([\d,]+)", (REPOSITORY / "SECURITY.md").read_text(encoding="utf-8"))
+    assert {name: int(number.rstrip(",").replace(",", "")) for name, number in rows} == asdict(Budgets())
+
+
 @pytest.mark.parametrize("command", sorted(find_commands()))
 def test_every_command_has_it(command):
     assert composed(command).budgets == asdict(Budgets())
@@ -34,6 +42,8 @@ def test_a_limit_is_raised_by_what_is_typed_alone_and_what_is_too_much_is_said_w
     require_within("views", 200_000, "FILE", "views")
     with pytest.raises(InputError, match=r"FILE has 200,001 views, .* add budgets\.views=200001"):
         require_within("views", 200_001, "FILE", "views")
+    with pytest.raises(InputError, match=r"FILE has more views than the limit of 200,000\. .* budgets\.views=400000"):
+        require_within("views", math.inf, "FILE", "views")
 
 
 @pytest.mark.parametrize("value", ["0", "-3", "many", "1.5", ""])
