@@ -9,6 +9,7 @@ At the end nothing that was loaded is taken apart, which takes a second, and not
 import atexit
 import os
 import select
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -60,6 +61,9 @@ def _exit_code(stop: SystemExit) -> int:
 
 
 def _end(code: int) -> None:
+    # All is written: a further Ctrl-C ends the process at once, instead of as a traceback of what runs at the end.
+    if callable(signal.getsignal(signal.SIGINT)):  # not where it is ignored, as in jobs in the background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     # What multiprocessing does at the end of its processes.
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()

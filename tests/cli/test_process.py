@@ -1,5 +1,6 @@
 """A process of `nerf` ends as any does, but for the time that Python takes to tear down what it has loaded."""
 
+import signal
 import subprocess
 import sys
 
@@ -37,6 +38,11 @@ def test_threads_and_what_is_registered_for_the_end_come_first():
         "    print('block')"
     )
     assert (done.returncode, done.stdout.split()) == (0, ["block", "thread", "registered"])
+
+
+def test_ctrl_c_at_the_end_ends_it_at_once_and_without_a_word():
+    done = ended("import os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)")
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
 @pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])
