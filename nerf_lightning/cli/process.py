@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 from nerf_lightning.messages.errors import InputError
 
@@ -34,7 +35,27 @@ def main() -> None:
         from nerf_lightning.cli.main import main as answer
 
         keep_from_subprocesses()
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in a job in the background
+            signal.signal(signal.SIGINT, _interrupt)
+            sys.unraisablehook = _unraisable
         answer()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt for the first Ctrl-C; the next one ends the process at once, whatever it waits for."""
+    signal.signal(number, signal.SIG_DFL)
+    raise KeyboardInterrupt
+
+
+def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    if unraisable.exc_type is KeyboardInterrupt:  # in a callback of llvmlite, say, which would go on
+        signal.raise_signal(signal.SIGINT)
+    sys.__unraisablehook__(unraisable)
+
+
+def was_interrupted() -> bool:
+    """Return whether there was a Ctrl-C; a library in which it is raised may turn it into an error of its own."""
+    return signal.getsignal(signal.SIGINT) is signal.SIG_DFL
 
 
 @contextmanager

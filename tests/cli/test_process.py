@@ -19,6 +19,22 @@ loaded = Loaded()
 with quick_end():
     """
 
+INTERRUPTED = """
+import ctypes, signal
+from nerf_lightning.cli import main as command_line, process
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
+
+@command_line.explained("train")
+def answer():
+    {}
+    print("went on")
+
+command_line.main = answer
+process.main()
+"""
+LIBRARY = "try: signal.raise_signal(signal.SIGINT)\n    except BaseException: {}"
+
 
 def ended(block: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", BEGIN + block], cwd=REPOSITORY, capture_output=True, text=True)
@@ -43,6 +59,20 @@ def test_threads_and_what_is_registered_for_the_end_come_first():
 def test_ctrl_c_at_the_end_ends_it_at_once_and_without_a_word():
     done = ended("import os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)")
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.parametrize(
+    ("block", "code"),
+    [
+        (LIBRARY.format("raise AttributeError from None"), 130),
+        (LIBRARY.format("signal.raise_signal(signal.SIGINT)"), -signal.SIGINT),
+        ("ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()", -signal.SIGINT),
+    ],
+)
+def test_ctrl_c_ends_it_whatever_a_library_makes_of_the_first_one(block, code):
+    script = INTERRUPTED.format(block)
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
 @pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])
