@@ -137,7 +137,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
     def task(config: "DictConfig") -> Any:
         # torch and Lightning take seconds, and --help needs neither.
-        with quick_imports():
+        with explained(command), quick_imports():
             module = command_module(command)
         # A job of a sweep may be in another process than the command line was read in.
         set_limits(Budgets(**config.budgets))
