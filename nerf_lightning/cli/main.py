@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import PATHS_ALONE, prepared
-from nerf_lightning.cli.process import ends_quietly, require_no_settings_here
+from nerf_lightning.cli.process import ends_quietly, require_no_settings_here, was_interrupted
 from nerf_lightning.cli.quoting import quoted_paths
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.config.manual.suggestions import did_you_mean
@@ -47,6 +47,7 @@ nerf help NAME explains a setting, group or option: nerf help trainer.max_steps.
 nerf help WORDS searches: nerf help blurry, nerf help learning rate.
 python -m nerf_lightning is the same."""
 USAGE_ERROR = 2
+INTERRUPTED = 130
 MOST_LETTERS = 5000
 
 
@@ -136,7 +137,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
     def task(config: "DictConfig") -> Any:
         # torch and Lightning take seconds, and --help needs neither.
-        with quick_imports():
+        with explained(command), quick_imports():
             module = command_module(command)
         # A job of a sweep may be in another process than the command line was read in.
         set_limits(Budgets(**config.budgets))
@@ -178,9 +179,9 @@ def explained(command: str) -> Iterator[None]:
     try:
         with ends_quietly():
             yield
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except Exception as error:
+    except (KeyboardInterrupt, Exception) as error:
+        if isinstance(error, KeyboardInterrupt) or was_interrupted():
+            sys.exit(INTERRUPTED)
         from nerf_lightning.config.messages import paragraph
 
         message = paragraph(error, command)

@@ -9,11 +9,13 @@ At the end nothing that was loaded is taken apart, which takes a second, and not
 import atexit
 import os
 import select
+import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
+from types import FrameType
 
 from nerf_lightning.messages.errors import InputError
 
@@ -35,7 +37,27 @@ def main() -> None:
 
         keep_from_subprocesses()
         write_any_name()
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in a job in the background
+            signal.signal(signal.SIGINT, _interrupt)
+            sys.unraisablehook = _unraisable
         answer()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt for the first Ctrl-C; the next one ends the process at once, whatever it waits for."""
+    signal.signal(number, signal.SIG_DFL)
+    raise KeyboardInterrupt
+
+
+def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    if unraisable.exc_type is KeyboardInterrupt:  # in a callback of llvmlite, say, which would go on
+        signal.raise_signal(signal.SIGINT)
+    sys.__unraisablehook__(unraisable)
+
+
+def was_interrupted() -> bool:
+    """Return whether there was a Ctrl-C; a library in which it is raised may turn it into an error of its own."""
+    return signal.getsignal(signal.SIGINT) is signal.SIG_DFL
 
 
 @contextmanager
@@ -62,6 +84,9 @@ def _exit_code(stop: SystemExit) -> int:
 
 
 def _end(code: int) -> None:
+    # All is written: a further Ctrl-C ends the process at once, instead of as a traceback of what runs at the end.
+    if callable(signal.getsignal(signal.SIGINT)):  # not where it is ignored, as in jobs in the background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     # What multiprocessing does at the end of its processes.
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()

@@ -68,10 +68,10 @@ def paragraph(error: BaseException, command: str) -> str | None:
 
 
 def _of_machine(error: MemoryError | RuntimeError) -> str | None:
-    # Imported late: it brings torch, which a config is composed without.
-    from nerf_lightning.nerf.models.tiles import is_device_failure, is_out_of_memory
-
     reason = " ".join(str(error).split())
+    if not isinstance(error, MemoryError):
+        # Imported late: it brings torch, which a config is composed without, and which a small memory cannot hold.
+        from nerf_lightning.nerf.models.tiles import is_device_failure, is_out_of_memory
     if isinstance(error, MemoryError) or is_out_of_memory(error):
         return (
             f"Not enough memory: {reason.partition('. ')[0] or 'Python got none'}. Use a smaller model or smaller "

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nerf_lightning.export.base import Export, require_free
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_colmap
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation
@@ -27,6 +28,7 @@ CAMERA_MODELS: dict[LensModel, str] = {
     "fisheye": "OPENCV_FISHEYE",
     "equirectangular": "EQUIRECTANGULAR",
 }
+MADE_BY = {"made_by": "nerf export what=cameras"}
 WHOLE = 1e-3  # Of a panorama's size, to which it shows all directions.
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 COLMAP_TAKES = {"pinhole": [], "radial_tangential": [0, 1, 4, 5], "fisheye": [0, 1, 2, 3]}
@@ -50,8 +52,9 @@ class CamerasExport(Export):
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the files."""
         cameras = in_user_frame(record)
-        transforms = folder / "transforms.json"
-        require_free(files=[transforms], folders=[folder / "sparse", folder / "sparse" / "0"])
+        transforms, model_folder = folder / "transforms.json", folder / "sparse" / "0"
+        require_free(files=[transforms], folders=[folder / "sparse", model_folder])
+        _require_own(transforms, model_folder)
         write_json(transforms, self._transforms(record, cameras))
         if reason := beyond_colmap(cameras):
             log.warning("%s No COLMAP model is written, only transforms.json.", reason)
@@ -66,11 +69,21 @@ class CamerasExport(Export):
         prefix = f"{self.images.rstrip('/')}/" if self.images else ""
         names = [prefix + name for name in record.view_names]
         frames = [_frame(cameras, view, name) for view, name in enumerate(names)]
-        content: dict[str, Any] = {"camera_model": CAMERA_MODELS[cameras.lens_model], "frames": frames}
+        content: dict[str, Any] = {**MADE_BY, "camera_model": CAMERA_MODELS[cameras.lens_model], "frames": frames}
         if record.splits.get("train") and (record.splits.get("val") or record.splits.get("test")):
             for split, views in record.splits.items():
                 content[f"{split}_filenames"] = [names[view] for view in views]
         return content
+
+
+def _require_own(transforms: Path, *others: Path) -> None:
+    """Refuse to replace the cameras of a capture, whose files have the same names."""
+    theirs = [path for path in (transforms, *others) if path.exists()]
+    if theirs and not MADE_BY.items() <= read_json_object(transforms).items():
+        raise InputError(
+            f"{theirs[0]} was not written by nerf export, and would be lost. Move it away, or give another folder with "
+            "paths.output_dir=DIR."
+        )
 
 
 def in_user_frame(record: SceneRecord) -> Cameras:

@@ -1,6 +1,7 @@
 """A process of `nerf` ends as any does, but for the time that Python takes to tear down what it has loaded."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -18,6 +19,22 @@ class Loaded:
 loaded = Loaded()
 with quick_end():
     """
+
+INTERRUPTED = """
+import ctypes, signal
+from nerf_lightning.cli import main as command_line, process
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
+
+@command_line.explained("train")
+def answer():
+    {}
+    print("went on")
+
+command_line.main = answer
+process.main()
+"""
+LIBRARY = "try: signal.raise_signal(signal.SIGINT)\n    except BaseException: {}"
 
 
 def ended(block: str) -> subprocess.CompletedProcess[str]:
@@ -54,6 +71,25 @@ subprocess.run([sys.executable, "-c", "print('\u65b0.png')"], check=True)
     env = os.environ | {"PYTHONIOENCODING": "cp1252"}
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, env=env)
     assert done.stdout.split() == [b"\\u65b0.png"] * 3, done.stderr.decode()
+
+
+def test_ctrl_c_at_the_end_ends_it_at_once_and_without_a_word():
+    done = ended("import os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)")
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.parametrize(
+    ("block", "code"),
+    [
+        (LIBRARY.format("raise AttributeError from None"), 130),
+        (LIBRARY.format("signal.raise_signal(signal.SIGINT)"), -signal.SIGINT),
+        ("ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()", -signal.SIGINT),
+    ],
+)
+def test_ctrl_c_ends_it_whatever_a_library_makes_of_the_first_one(block, code):
+    script = INTERRUPTED.format(block)
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
 @pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])

@@ -21,6 +21,7 @@ from support.posed_captures import (
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.cameras import CamerasExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 
 # Around an axis of no special place.
@@ -61,6 +62,18 @@ def test_round_trip_through_both_formats(tmp_path, camera):
     same_rays(scene, back, {name: f"images/{name}" for name in known.names})
     text = (folder / "sparse" / "0" / "cameras.txt").read_text()
     assert len([line for line in text.splitlines() if not line.startswith("#")]) == 1  # one camera for all
+
+
+@pytest.mark.parametrize("write", [write_transforms, write_colmap])
+def test_the_cameras_of_a_capture_are_not_replaced_and_those_exported_before_are(tmp_path, write):
+    record = scene_record(read("colmap", write_colmap(tmp_path / "made", known_turned())))
+    capture = write(tmp_path / "capture", known_turned())
+    before = {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="was not written by nerf export, and would be lost"):
+        CamerasExport().export(solid(ball()), record, capture, 65_536)
+    assert before == {path: path.read_bytes() for path in capture.rglob("*") if path.is_file()}
+    for _ in range(2):
+        CamerasExport().export(solid(ball()), record, tmp_path / "exported", 65_536)
 
 
 def test_a_forward_facing_capture_has_its_cameras_in_the_world(tmp_path):

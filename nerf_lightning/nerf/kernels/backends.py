@@ -13,6 +13,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -34,6 +35,7 @@ CUDA_BACKENDS = (
 """The modules that triton compiles."""
 FP_FUSION = "TRITON_DEFAULT_FP_FUSION"
 LONG_SECONDS = 2.0
+DIGEST_BYTES = hashlib.sha256().digest_size
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
 
@@ -115,14 +117,34 @@ def _imported(module: str) -> ModuleType:
 
 
 def _stamp_with_sources(module: ModuleType) -> None:
-    """Let numba compile kernels anew where a file changed that they take functions or numbers from.
+    """Let numba compile kernels anew where a file changed that they take functions or numbers from, or one is damaged.
 
-    numba compares a kept kernel with the kernel's own file alone.
+    numba compares a kept kernel with the kernel's own file alone, and loads it whatever its bytes are.
     """
     for kernel in _compiled(module):
         kept, digest = getattr(kernel._cache, "_cache_file", None), _digest(kernel.py_func.__module__)
         if kept is not None and digest not in str(kept._source_stamp):
             kept._source_stamp = f"{kept._source_stamp!r} {digest}"
+            kept._save_data, kept._load_data = partial(_save_checked, kept), partial(_load_checked, kept)
+
+
+def _save_checked(kept: Any, name: str, kernel: object) -> None:
+    """Write a compiled kernel to numba's cache, followed by its checksum."""
+    content = kept._dump(kernel)
+    with kept._open_for_write(kept._data_path(name)) as file:
+        file.write(content + hashlib.sha256(content).digest())
+
+
+def _load_checked(kept: Any, name: str) -> Any:
+    """Load a compiled kernel.
+
+    Raises:
+        OSError: it is damaged; numba then compiles it again.
+    """
+    content = Path(kept._data_path(name)).read_bytes()
+    if hashlib.sha256(content[:-DIGEST_BYTES]).digest() != content[-DIGEST_BYTES:]:
+        raise OSError("damaged")
+    return type(kept)._load_data(kept, name)  # unpickling ends where the checksum begins
 
 
 @functools.cache

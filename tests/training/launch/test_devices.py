@@ -2,6 +2,7 @@
 
 import logging
 import platform
+import sys
 import warnings
 
 import pytest
@@ -90,6 +91,11 @@ def test_a_machine_that_runs_out_of_memory_ends_with_one_paragraph(error, reason
     assert told.startswith(f"Not enough memory: {reason}. Use a smaller model")
     assert "\n" not in told
     assert paragraph(RuntimeError("a mistake of ours"), "train") is None
+
+
+def test_memory_that_cannot_hold_torch_is_named_without_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "nerf_lightning.nerf.models.tiles", None)
+    assert str(paragraph(MemoryError(), "train")).startswith("Not enough memory: Python got none.")
 
 
 @pytest.mark.parametrize("kind", [torch.AcceleratorError, RuntimeError])
