@@ -35,7 +35,7 @@ OURS = {
     "files/html.py": ["read_text"],
     "runs/published.py": ["read_text", "safe_load"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
-    "nerf/kernels/backends.py": ["read_bytes", "read_text"],
+    "nerf/kernels/backends.py": ["read_bytes", "read_bytes", "read_text"],
     "cli/worker.py": ["load", "load"],
 }
 # For writing, in a folder of its own, or of what was opened by us.
@@ -48,7 +48,7 @@ OTHERWISE = {
     "data/bricks/parts.py": ["read_text"],
     "data/pixels/images.py": ["open"],
     "files/json_files.py": ["loads"],
-    "files/numpy_files.py": ["loadtxt", "open", "read_array"],
+    "files/numpy_files.py": ["load", "loadtxt", "read_array"],
     "files/xml_files.py": ["fromstring"],
     "files/yaml_files.py": ["load"],
     "data/pixels/decoding.py": ["open"],

@@ -114,11 +114,11 @@ def test_refuses_content(path, changed, message):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda content: b"", r"a.npz cannot be read \(BadZipFile: .*Remove it, and copy"),
-        (lambda content: b"not an archive", r"a.npz cannot be read \(BadZipFile"),
-        (lambda content: b"PK\x03\x04 cut short", r"a.npz cannot be read \(BadZipFile"),
-        (lambda content: content[:2000], r"a.npz cannot be read \(BadZipFile"),
-        (lambda content: npy(np.zeros(3)), r"a.npz cannot be read .* It needs images"),
+        (lambda content: b"", r"a.npz is damaged.*not one zip archive.*Remove it, and copy"),
+        (lambda content: b"not an archive", r"a.npz is damaged.*not one zip archive"),
+        (lambda content: b"PK\x03\x04 cut short", r"a.npz is damaged.*not one zip archive"),
+        (lambda content: content[:2000], r"a.npz is damaged.*not one zip archive"),
+        (lambda content: npy(np.zeros(3)), r"a.npz is damaged.* It needs images"),
     ],
 )
 def test_refuses_files_that_are_no_npz(tmp_path, damage, message):
