@@ -29,7 +29,11 @@ MADE_AGAIN = "Remove it, and it will be made again."
 MOST_NAMES = 10  # Of a folder, in a message
 
 
-class AbsentError(InputError):
+class UnopenedError(InputError, OSError):
+    """Report a file that the system does not open; whoever takes an OSError for its answer takes this, too."""
+
+
+class AbsentError(UnopenedError):
     """Report that there is no file at a path."""
 
 
@@ -45,7 +49,8 @@ def open_regular(path: Path, size: str | int | None, cure: str = CURE, follow_li
 
     Raises:
         AbsentError: there is none.
-        InputError: it is no regular file, is larger, is a link that is not followed, or cannot be opened.
+        UnopenedError: the system refuses to open it.
+        InputError: it is no regular file, is larger, or is a link that is not followed.
     """
     return os.fdopen(_opened(path, os.O_RDONLY, size, cure, follow_links), "rb")
 
@@ -149,7 +154,7 @@ def _opened(path: Path, flags: int, size: str | int | None, cure: str, follow_li
         with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
             _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
         if isinstance(error, PermissionError) or os.path.exists(path):
-            raise InputError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}. {cure}") from error
+            raise UnopenedError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}. {cure}") from error
         held = "" if os.path.islink(path) else f"; the folder holds {contents(path.parent)}"
         raise AbsentError(f"{path} {what_is(path)}{held}. Put the file there, or give another path.") from error
     try:
