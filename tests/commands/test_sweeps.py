@@ -128,7 +128,7 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     assert code == -signal.SIGKILL
     told = next(line for line in output.splitlines() if "if it stops, resume with" in line)
     command = told.partition("resume with: nerf ")[2].split()
-    assert command == ["train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"]
+    assert command == ["train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "logger=none"]
     before = json.loads((tmp_path / "0_seed=0" / "run.json").read_text())
     code, output = run(*command)
     assert code == 0, output
