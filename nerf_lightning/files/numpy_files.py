@@ -4,8 +4,9 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -28,8 +29,8 @@ def read_npy(path: Path, cure: str) -> Shaped[ndarray, "..."]:
 
 
 @contextmanager
-def open_npz(path: Path, cure: str) -> Iterator[Mapping[str, ndarray]]:
-    """Open an .npz file: its arrays by name, each of which is read when it is asked for."""
+def open_npz(path: Path, cure: str) -> Iterator[dict[str, Callable[[], ndarray]]]:
+    """Open an .npz file: by the name of each array, what reads it."""
     with reading(path, cure), open_regular(path, "npz", cure) as opened:
         file = HeaderReader(opened, ENTRY_BYTES * limits().npz_arrays, "npz_arrays", path, "arrays")
         with zipfile.ZipFile(file) as archive:  # hands out no more of an entry than the size that it announces
@@ -37,24 +38,12 @@ def open_npz(path: Path, cure: str) -> Iterator[Mapping[str, ndarray]]:
             size = sum(entry.file_size for entry in archive.infolist())
             require_within("npz_bytes", size, path, "bytes once it is unpacked")
             file.left = None
-            yield _Arrays(archive)
+            yield {each.filename.removesuffix(".npy"): partial(_entry, archive, each) for each in archive.infolist()}
 
 
-class _Arrays(Mapping[str, ndarray]):
-    def __init__(self, archive: zipfile.ZipFile):
-        self.archive = archive
-        self.entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-
-    def __getitem__(self, name: str) -> ndarray:
-        entry = self.entries[name]
-        with self.archive.open(entry) as file:
-            return _array(file, entry.file_size)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.entries)
-
-    def __len__(self) -> int:
-        return len(self.entries)
+def _entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Shaped[ndarray, "..."]:
+    with archive.open(entry) as file:
+        return _array(file, entry.file_size)
 
 
 def _array(file: IO[bytes] | io.BufferedIOBase, size: int) -> Shaped[ndarray, "..."]:
@@ -69,7 +58,5 @@ def _array(file: IO[bytes] | io.BufferedIOBase, size: int) -> Shaped[ndarray, ".
 
 
 def read_columns(lines: Iterable[str], columns: list[int], count: int) -> Float[ndarray, "rows columns"]:
-    """Return columns of the first rows of a text of numbers."""
-    if not count:
-        return np.zeros((0, len(columns)))
+    """Return columns of the first rows of a text of numbers, at least one."""
     return np.loadtxt(lines, usecols=columns, max_rows=count, ndmin=2, comments=None)

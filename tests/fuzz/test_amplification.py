@@ -31,7 +31,7 @@ from nerf_lightning.report.curves import read_curves
 
 def read_npz(path):
     with open_npz(path, "") as arrays:
-        return [arrays[name] for name in arrays]
+        return [read() for read in arrays.values()]
 
 def caught(read):  # as the reader of captures does
     def read_caught(path):

@@ -107,7 +107,7 @@ def _load(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     with open_npz(path, CURE) as archive:
         if missing := [key for key in KEYS if key not in archive]:
             raise InputError(f"{path} lacks {listed(missing)}; it has {listed(archive) or 'nothing'}. {LAYOUT}")
-        images, poses, focal = (np.asarray(archive[key]) for key in KEYS)
+        images, poses, focal = (np.asarray(archive[key]()) for key in KEYS)
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise InputError(f"{path}: images has the shape {images.shape}. {LAYOUT}")
     require_within("views", len(images), path, "views")

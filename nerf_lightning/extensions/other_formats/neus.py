@@ -80,7 +80,7 @@ def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, F
         wanted = [match for key in archive if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
         require_within("views", len(wanted) // 2, path, "views")
         for match in wanted:
-            if np.shape(matrix := archive[match[0]]) == (4, 4):
+            if np.shape(matrix := archive[match[0]]()) == (4, 4):
                 found[match[1]][int(match[2])] = np.asarray(matrix, np.float64)
     if not found["world"]:
         raise InputError(
