@@ -4,6 +4,7 @@
 walks through them, and merge keys (`<<`) do so while the file is read. No file that this program writes has any.
 """
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,21 @@ class _PlainLoader(yaml.SafeLoader):
         self.depth -= 1
         return node
 
+    def construct_yaml_int(self, node: Any) -> int:
+        if (number := super().construct_yaml_int(node)).bit_length() > MOST_BITS:
+            raise yaml.YAMLError("it holds a number that is too large")
+        return number
+
+
+_PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_yaml_int)
+
 
 def plain_yaml(text: str, where: str | Path, cure: str = CURE) -> Any:
     """Return what a yaml text from anybody holds; `where` it stands, and the cure of a bad one, are for the message."""
     require_text_within("yaml", text, where)
     try:
         content = yaml.load(text, Loader=_PlainLoader)
-        _require_plain(content)
+        json.dumps(content, sort_keys=True)  # refuses what json has not: dates, bytes, sets, keys of several kinds
         return content
     except yaml.YAMLError as error:
         raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {cure}") from error
@@ -50,20 +59,3 @@ def plain_yaml(text: str, where: str | Path, cure: str = CURE) -> Any:
 def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     """Return what a yaml file holds."""
     return plain_yaml(read_text(path, "yaml", cure), path, cure)
-
-
-def _require_plain(content: Any) -> None:
-    """Refuse what yaml knows and json does not: what reads a config sorts its keys, and writes its values down."""
-    waiting = [content]
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, dict):
-            if len({type(key) for key in node}) > 1 or not all(isinstance(key, (str, int, float)) for key in node):
-                raise ValueError("keys of other kinds than text, or of several")
-            waiting += [*node, *node.values()]
-        elif isinstance(node, list):
-            waiting += node
-        elif isinstance(node, int) and node.bit_length() > MOST_BITS:
-            raise ValueError("a number that is too large")
-        elif not (node is None or isinstance(node, (str, int, float))):
-            raise ValueError("neither text nor a number")

@@ -39,7 +39,7 @@ def read_ply_points(path: Path) -> ColmapPoints:
         order, count, kind = _header(head[:end].decode("ascii", "replace"), path)
         require_within("points", count, path, "points")
         file.seek(body)
-        if order == "ascii":
+        if order == "ascii" and count:
             columns = [(kind.names or ()).index(axis) for axis in "xyz"]
             positions = read_columns(read_lines(file, "ascii"), columns, count)
         else:
