@@ -20,6 +20,7 @@ from types import FrameType
 from nerf_lightning.messages.errors import InputError
 
 FAILED = 1
+BAD_INPUT = 2
 READER_LEFT = 141
 """128 + SIGPIPE, what a shell says of `yes` too; a sweep takes it for a stop, not for a job that failed."""
 STDOUT, STDERR = 1, 2
@@ -39,7 +40,7 @@ def main() -> None:
         write_any_name()
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in a job in the background
             signal.signal(signal.SIGINT, _interrupt)
-            sys.unraisablehook = _unraisable
+        sys.unraisablehook = _unraisable
         answer()
 
 
@@ -52,6 +53,11 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
     if unraisable.exc_type is KeyboardInterrupt:  # in a callback of llvmlite, say, which would go on
         signal.raise_signal(signal.SIGINT)
+    if unraisable.exc_type is MemoryError:  # in scikit-image's marching cubes, which would go on for ever
+        print(
+            "nerf: Not enough memory: a library got none. Use a smaller model, picture or resolution.", file=sys.stderr
+        )
+        os._exit(BAD_INPUT)
     sys.__unraisablehook__(unraisable)
 
 

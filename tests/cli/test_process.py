@@ -92,6 +92,13 @@ def test_ctrl_c_ends_it_whatever_a_library_makes_of_the_first_one(block, code):
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
+def test_memory_that_a_library_does_not_get_ends_it_even_where_the_library_goes_on():
+    script = INTERRUPTED.format("ctypes.CFUNCTYPE(None)(lambda: [0] * (1 << 60))()")
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("nerf: Not enough memory")
+
+
 @pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])
 def test_what_went_wrong_is_told_by_python(block):
     done = ended(block)
