@@ -14,7 +14,7 @@ OURS = {
     "commands/train_job/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
-    "cli/process.py": ["print", "open"],
+    "cli/process.py": ["print", "print", "open"],
     "__init__.py": ["read_text"],
     "cli/help.py": ["read_text"],
     "config/manual/docstrings.py": ["read_text"],
@@ -34,7 +34,7 @@ OURS = {
     "files/html.py": ["read_text"],
     "runs/published.py": ["read_text"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
-    "nerf/kernels/backends.py": ["read_bytes", "read_text"],
+    "nerf/kernels/backends.py": ["read_bytes", "read_bytes", "read_text"],
     "cli/worker.py": ["load", "load"],
 }
 # For writing, in a folder of its own, or of what was opened by us.
