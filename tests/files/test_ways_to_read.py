@@ -15,7 +15,7 @@ OURS = {
     "commands/train_job/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
-    "cli/process.py": ["print", "open"],
+    "cli/process.py": ["print", "print", "open"],
     "__init__.py": ["read_text"],
     "cli/help.py": ["read_text"],
     "config/manual/docstrings.py": ["read_text"],
