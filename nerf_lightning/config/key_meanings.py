@@ -98,7 +98,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.views"),
     (replace(AFTERWARDS, trust=Trust.WORDS), "path.**"),
     (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
-    (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
+    (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside"),
     (UNKNOWN, "scene.download.**"),
     # How a sweep is cut into jobs and how many there are; what they run is no number or word.
     (replace(OF_THE_USER, trust=Trust.NUMBERS), "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),

@@ -38,7 +38,7 @@ class Budgets:
     video_bytes: int = 1 << 38
     video_frames: int = 1_000_000
     tensor_bytes: int = 1 << 36
-    tensor_objects: int = 1 << 24  # bytes of a PyTorch file that are not numbers
+    tensor_objects: int = 1 << 23  # bytes of a PyTorch file that are not numbers
     unpacked_bytes: int = 1 << 32  # of a checkpoint's quantized weights (nerf prune), in memory
     event_bytes: int = 1 << 29  # of a run's TensorBoard files
     event_values: int = 1_000_000

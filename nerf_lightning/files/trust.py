@@ -1,14 +1,8 @@
-"""The one rule for files that anybody may have made.
+"""The one rule for files that anybody may have made: nothing in them runs, and all has the type that it must have.
 
-* Nothing in a file runs. PyTorch files are read by `files.tensor_files`, yaml and json as data; classes come from an
-  allow-list (`checkpoints.trusted_classes`), settings from an allow-list by group (`config.key_meanings`).
-* Weights and optimizer state must have the keys, shapes and dtypes of a template, which is what this config builds, and
-  be finite; all else has the keys and types of its annotations (`require_fit`). A scene also passes the checks of every
-  capture (`data.captures.checks.check_scene`).
-* Integers that index or size memory are checked against their range, where they are used.
-* Anything else that a broken file raises while it is read becomes one paragraph that names the file (`reading`).
-
-Numbers are not judged one by one: a file may hold a wrong scene, but no harm.
+Weights and optimizer state fit a template, which is what this config builds; all else fits its annotations. Integers
+that index or size memory are checked against their range, where they are used. Numbers are not judged one by one: a
+file may hold a wrong scene, but no harm.
 """
 
 import math
@@ -33,8 +27,8 @@ CURE = "It is damaged, or was made by somebody else: use another one."
 class Mismatch(ValueError):
     """Report the first value that is not what it must be: where it is, and what is wrong with it."""
 
-    def __init__(self, place: str, problem: str):
-        super().__init__(f"{place} {problem}")
+    def __str__(self) -> str:
+        return " ".join(self.args)
 
 
 @contextmanager

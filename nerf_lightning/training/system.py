@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning.checkpoints.format import KEY, LOOPS
-from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
+from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, read_content
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.messages.errors import InputError
@@ -186,8 +186,10 @@ class RadianceFieldSystem(LightningModule):
             InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
         """
         trainer, step, path = self.trainer, self.step, Path(self.trainer.ckpt_path or LAST)
-        if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # which has checked what it read
-            require_ours(checkpoint, path)
+        if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # Lightning's own has checked nothing
+            content = read_content(path)
+            checkpoint.clear()
+            checkpoint.update(content)
         state = checkpoint[KEY]
         if trainer.state.fn == TrainerFn.FITTING:  # a model may be tested on any capture
             require_same_capture(state, self.record, self.resume_changed_capture)
