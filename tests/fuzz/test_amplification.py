@@ -110,7 +110,7 @@ def zip_end(size):
 
 # By the name of the case: the file's ending, its first bytes, where it ends if it is sparse, and its last bytes.
 CASES = {
-    "keys of a json": (".json", b'{"":0' + b"".join(b',"%x":1' % number for number in range(3_000_000)) + b"}"),
+    "keys of a json": (".json", b'{"":0' + b"".join(b',"number %d":1' % number for number in range(3_000_000)) + b"}"),
     "depth of a json": (".json", b'{"a":' * 500_000),
     "brackets of a json": (".json", b"[" + b"[]," * 1_900_000 + b"[]]"),
     "elements of an xml": (".xml", b"<a>" + b"<b/>" * 4_000_000 + b"</a>"),
