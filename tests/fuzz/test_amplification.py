@@ -111,16 +111,16 @@ def zip_end(size):
 
 # By the name of the case: the file's ending, its first bytes, where it ends if it is sparse, and its last bytes.
 CASES = {
-    "keys of a json": (".json", b'{"":0' + b"".join(b',"%x":1' % number for number in range(3_000_000)) + b"}"),
+    "keys of a json": (".json", b'{"":0' + b"".join(b',"number %d":1' % number for number in range(3_000_000)) + b"}"),
     "depth of a json": (".json", b'{"a":' * 500_000),
-    "brackets of a json": (".json", b"[" + b"[]," * 1_900_000 + b"[]]"),
+    "brackets of a json": (".json", b"[" + b"[]," * 900_000 + b"[]]"),
     "elements of an xml": (".xml", b"<a>" + b"<b/>" * 4_000_000 + b"</a>"),
-    "attributes of an xml": (".xml", b"<a>" + b'<b c=""/>' * 900_000 + b"</a>"),
+    "attributes of an xml": (".xml", b"<a>" + b'<b c=""/>' * 400_000 + b"</a>"),
     "depth of an xml": (".xml", b"<a>" * 400_000 + b"</a>" * 400_000),
     "nodes of a yaml": (".yaml", b"[" + b"a," * 400_000 + b"a]"),
     "depth of a yaml": (".yaml", b"[" * 60_000),
     "lines of a text": (".txt", b"\n" * 10_000_000),
-    "rows of a ply": (".ply", ply(1_000_000, 200), 1_600_100_000),
+    "rows of a ply": (".ply", ply(700_000, 200), 1_200_000_000),
     "columns of a ply": (".ply", ply(10**6, 3, "ascii"), 3_200_000_000),
     "shape of an npy": (".npy", npy(10**12, 17) + bytes(1000)),
     "list of an npz": (".npz", b"PK", 1_900_000_000, zip_end(1_900_000_000)),

@@ -12,6 +12,7 @@ from numpy import ndarray
 from PIL import ExifTags
 
 from nerf_lightning.data.pixels.images import DECODER_ERRORS, opened_picture
+from nerf_lightning.messages.errors import InputError
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Radius of the earth in meters, and by how much it is less at the poles (WGS 84)."""
@@ -31,7 +32,7 @@ def gps_of(path: Path) -> tuple[float, float, float] | None:
             said: Mapping[int, Any] = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
         place = [_degrees(said, key, negative) for key, negative in ((2, "S"), (4, "W"))]
         height = float(said.get(6, 0.0)) * (-1 if said.get(5) in (1, b"\x01") else 1)
-    except DECODER_ERRORS:
+    except (InputError, *DECODER_ERRORS):
         return None
     latitude, longitude = place
     sound = abs(latitude) <= 90 and abs(longitude) <= 180 and abs(height) < 1e5 and (latitude or longitude)

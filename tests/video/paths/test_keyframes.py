@@ -52,7 +52,7 @@ MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a value that cannot be read"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a number that is too large"),
         ("[" * 5000, "it nests more than 50 deep"),
         (MERGE_BOMB, r"it holds references \(\*name\)"),
         ("- !!python/object/apply:os.system [ls]", "is not readable yaml"),
