@@ -96,7 +96,8 @@ def require_no_way_out(folder: Path) -> None:
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
                 raise InputError(
                     f"{path} is a symbolic link to {os.readlink(path)}, which lies outside of {folder}, so it would be "
-                    "written to, or shown. Remove the link, or replace it with what it points to."
+                    "written to, or shown. Remove the link, replace it with what it points to, or give another folder "
+                    "(paths.output_dir=DIR)."
                 )
 
 

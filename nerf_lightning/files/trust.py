@@ -128,7 +128,7 @@ def _require_number_or_word(value: Any, kind: type, place: str) -> None:
 
 
 def _require_type(value: Any, kind: type, place: str) -> None:
-    if type(value) is not kind:
+    if not (isinstance(value, kind) if kind in (dict, Tensor) else type(value) is kind):
         raise Mismatch(place or "the file", f"is {shown(value)}, not of the type {kind.__name__}")
 
 

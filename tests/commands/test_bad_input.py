@@ -24,7 +24,7 @@ def test_files_that_are_no_checkpoint_to_use_are_named(nerf, last, tmp_path):
         missing = nerf(command, f"ckpt={tmp_path}/none.ckpt")
         said(missing, "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt")
     (tmp_path / "cut.ckpt").write_bytes(last.read_bytes()[:5000])
-    said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), "cut.ckpt cannot be read", "train again")
+    said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), "cut.ckpt is damaged", "train again")
     content = torch.load(last, weights_only=True)
     content["nerf_lightning"]["format"] = 99
     torch.save(content, tmp_path / "changed.ckpt")
@@ -56,7 +56,7 @@ def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
         ("trainer.precision=16-mixed", "it must be auto, 32-true, tf32, bf16-mixed"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path=photographs path.views=-1", "path.views=-1 is not valid: it must be a list or null"),
-        ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
+        ("path=keyframes path.file=none.yaml", "none.yaml does not exist"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
         ("data.batch_rays=0", "data.batch_rays=0"),

@@ -59,7 +59,7 @@ def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs_where_there_
     assert found
     for name, (photographed, _) in found.items():
         np.testing.assert_allclose(photographed, images[int(name)].mean(axis=(0, 1)), atol=3e-3)
-    for without, told in (("photographs=false", ""), (f"scene.path={tmp_path}/gone.npz", "and are left out: The file")):
+    for without, told in (("photographs=false", ""), (f"scene.path={tmp_path}/gone.npz", "gone.npz does not exist")):
         (tmp_path / "mean_colors.json").unlink()
         result = nerf(*given, without)
         assert result.code == 0, result.err

@@ -234,8 +234,13 @@ def test_values_that_are_paths_name_no_folders(tmp_path):
 def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
     planted = ("scene=llff", "scene.root=absent", "scene.name=a,b", "scene.name=../../../ESCAPED")
     leave("sweep", tmp_path / "x" / "sweep", *planted)
-    result = nerf("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}/x/sweep")
-    assert "1 of 1 jobs failed. 0_scene.name=.._.._.._ESCAPED: The folder absent does not exist" in result.err
+    said(
+        nerf("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}/x/sweep"),
+        "'scene.name=../../../ESCAPED'",
+    )
+    typed = ("scene=llff", "scene.root=absent", "seed=0,1", "hydra.sweep.subdir=../ESCAPED_${hydra.job.num}")
+    result = nerf("train", "-m", *typed, f"paths.output_dir={tmp_path}/x/typed")
+    assert "2 of 2 jobs failed. .._ESCAPED_0, .._ESCAPED_1: The folder absent does not exist" in result.err
     assert "Traceback" not in result.err
 
 

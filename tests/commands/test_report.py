@@ -172,7 +172,7 @@ def test_a_link_that_leads_out_is_refused(nerf, tmp_path, name):
     link.unlink(missing_ok=True)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(tmp_path / "secret")
-    said(nerf("report", run, f"paths.output_dir={tmp_path}/out"), "symbolic link", "would be shown")
+    said(nerf("report", run, f"paths.output_dir={tmp_path}/out"), "symbolic link", "or shown")
 
 
 def test_what_is_too_large_or_no_film_or_no_log_is_left_out(nerf, tmp_path):

@@ -273,7 +273,7 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
     assert_equal(rest, whole)
     assert not [name for name in read_checkpoint(found).weights if "shift" in name]
     goes_on, other = trainer(max_steps=12), run()
-    with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no part"):
+    with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no file"):
         goes_on.fit(other.system, other.data, ckpt_path=found)
 
 

@@ -93,7 +93,7 @@ def test_content_hides_what_is_drawn_behind_it(tmp_path):
 
 def test_a_saved_path_is_listed_and_loaded(panel, tmp_path):
     panel.press("Save as yaml")
-    assert "`path=keyframes path.file=" in panel.said()
+    assert "` path=keyframes path.file=" in panel.said()
     assert panel.gui.made["Saved"].options == ("camera_path_001.yaml",)
     (tmp_path / "viewer" / "bad.yaml").write_text("- {position: [0, 0, 1]}\n")
     panel.press("Delete keyframe")
@@ -116,4 +116,4 @@ def test_a_folders_name_is_no_markup(tmp_path):
     for _ in range(2):
         panel.press("Add keyframe")
     panel.press("Save as yaml")
-    assert panel.said().endswith(f"`path=keyframes path.file={tmp_path}/<script>/camera_path_001.yaml`")
+    assert panel.said().endswith(f"` path=keyframes path.file={tmp_path}/<script>/camera_path_001.yaml `")

@@ -79,7 +79,7 @@ WRONG = {
     "large": ({"scales": torch.full((2,), 3e38)}, "coarse.field.feature.weight holds NaN or infinity"),
     "another shape": ({"shape": [1, 1024]}, "in a table of [1, 1024]"),
     "a bomb": ({"shape": [1 << 30, 32]}, "bytes of quantized weights, once they are unpacked"),
-    "a key": ({"more": "words"}, "which no file of this program does"),
+    "a key": ({"more": "words"}, "more belongs to no file of this kind"),
 }
 
 
