@@ -288,6 +288,11 @@ def test_checkpoints_of_other_runs_programs_and_strangers_are_refused(run, train
     again = run()
     with pytest.raises(InputError, match="not a checkpoint of nerf_lightning"):
         trainer(max_steps=4).fit(again.system, again.data, ckpt_path=tmp_path / "other.ckpt")
+    damaged = bytearray(Path(saved[1]).read_bytes())
+    damaged[len(damaged) // 2] ^= 1  # which Lightning's own reader does not notice
+    (tmp_path / "damaged.ckpt").write_bytes(damaged)
+    with pytest.raises(InputError, match="wrong checksum"):
+        trainer(max_steps=4).fit(again.system, again.data, ckpt_path=tmp_path / "damaged.ckpt")
     content = torch.load(saved[1], weights_only=True)
     content["nerf_lightning"]["config"] = "model: {_target_: os.system, command: touch here}"
     torch.save(content, tmp_path / "stranger.ckpt")
