@@ -21,6 +21,7 @@ from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, scene_of
 from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.data.captures.checks import check_scene
+from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.files.trust import Mismatch, reading, require_fit, shown
 from nerf_lightning.messages.errors import InputError
@@ -160,7 +161,20 @@ def read_content(path: Path) -> dict[str, Any]:
         InputError: as `read_checkpoint`.
     """
     content = _load(path)
-    require_ours(content, path)
+    record = content.get(KEY)
+    if not isinstance(record, dict) or "state_dict" not in content:
+        raise InputError(
+            f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
+            "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
+        )
+    written, version = record.get("format"), shown(record.get("version")).strip("'")
+    if type(written) is not int or written != FORMAT:
+        raise InputError(
+            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
+            f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
+        )
+    with reading(path, _instead_of(path)):
+        require_checkpoint(content, str(path))
     return content
 
 
@@ -181,28 +195,6 @@ def content_to_resume(path: Path) -> dict[str, Any]:
     """
     kept, _Kept.content = _Kept.content, None
     return kept[1] if kept is not None and path.is_file() and kept[0] == _identity(path) else read_content(path)
-
-
-def require_ours(content: dict[str, Any], path: Path) -> None:
-    """Refuse what was loaded from a file and is not as `checkpoints.format` says.
-
-    Raises:
-        InputError: with the first thing that is not.
-    """
-    record = content.get(KEY)
-    if not isinstance(record, dict) or "state_dict" not in content:
-        raise InputError(
-            f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
-            "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
-        )
-    written, version = record.get("format"), shown(record.get("version")).strip("'")
-    if type(written) is not int or written != FORMAT:
-        raise InputError(
-            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
-            f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
-        )
-    with reading(path, _instead_of(path)):
-        require_checkpoint(content, str(path))
 
 
 def newest_checkpoint(folder: Path, to_resume: bool = False) -> Checkpoint | None:
@@ -249,13 +241,14 @@ def last_good_checkpoint(folder: Path) -> Path | None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(
-            f"There is no checkpoint at {path}. A run keeps its checkpoints in RUN_FOLDER/checkpoints/; "
-            "look there for last.ckpt or best.ckpt."
-        )
     with reading(path, _instead_of(path)):
-        content = load_tensors(path)
+        try:
+            content = load_tensors(path)
+        except AbsentError as error:
+            raise InputError(
+                f"There is no checkpoint at {path}. A run keeps its checkpoints in RUN_FOLDER/checkpoints/; "
+                "look there for last.ckpt or best.ckpt."
+            ) from error
     return content if isinstance(content, dict) else {}
 
 

@@ -17,6 +17,7 @@ from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
 from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, meaning_of
+from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
@@ -39,9 +40,10 @@ def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
         InputError: the file is no list of overrides, or holds one that is not repeated from files.
     """
     saved = run_folder / ".hydra" / "overrides.yaml"
-    if not saved.is_file():
+    try:
+        lines = read_plain_yaml(saved)
+    except AbsentError:
         return []
-    lines = read_plain_yaml(saved)
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError(f"{saved} is not a list of overrides: it is damaged. Give the run's settings by hand.")
     return list(_repeated(lines, arguments, saved, of_sweep=False))

@@ -7,6 +7,7 @@ import yaml
 
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
@@ -41,9 +42,10 @@ def sweep_record(sweep_folder: Path) -> Path:
 def read_sweep(sweep_folder: Path) -> SweepRecord | None:
     """Return what a sweep was started with, None where the folder holds no sweep."""
     record = sweep_record(sweep_folder)
-    if not record.is_file():
+    try:
+        content = read_plain_yaml(record)
+    except AbsentError:
         return None
-    content = read_plain_yaml(record)
     arguments = content.get("arguments") if isinstance(content, dict) else None
     if not isinstance(arguments, list) or not all(isinstance(argument, str) for argument in arguments):
         raise InputError(f"{record} is not a record of a sweep. {CURE}")
