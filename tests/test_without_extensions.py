@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.toml", "LICENSE", "README.md")
+PAGES = ("LICENSE", "README.md", "SECURITY.md")
+COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.toml", *PAGES)
 DOCUMENTS = ("tests/test_documents.py", "tests/test_packaging.py")
 """They are of the whole project, and name commands and files of extensions."""
 
