@@ -103,6 +103,7 @@ def require_training_state(content: Mapping[str, Any], path: Path) -> None:
             "save_weights_only=True and nerf prune save it. It can be rendered, evaluated and exported, but not "
             "resumed. Resume another checkpoint of the run, or start a new run from these weights (init_from=FILE)."
         )
-    require_fit(content[KEY], RECORD | OF_A_RUN, KEY, OPTIONAL)
+    for key in OF_A_RUN.keys() - content[KEY].keys():  # those that are there have been checked
+        raise Mismatch(f"{KEY}.{key}", "is missing")
     if Version(content[LIGHTNING]) < Version("2.0"):
         raise Mismatch(LIGHTNING, "is of a version that this program has never used")

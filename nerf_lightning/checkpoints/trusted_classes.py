@@ -34,10 +34,10 @@ def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None
     Raises:
         InputError: it names what is no part of a model of ours, or holds what no config of ours does.
     """
-    for key, value in _leaves(node):
+    for key, value in _settings(node):
         if key == "_target_":
             _require_contract(str(value), source, trusted)
-        elif key.startswith("_") or "${" in str(value):
+        elif key.startswith("_") or (isinstance(value, str) and "${" in value):
             raise InputError(f"{source}: its model part holds {key}: {value}, which is not read from files.")
         elif isinstance(value, (int, float)) and not abs(value) <= LARGEST_NUMBER:
             raise InputError(f"{source}: its model part holds the number {value:.3g}, which no model has.")
@@ -49,14 +49,16 @@ def modules_to_trust(node: Any) -> list[str]:
     >>> modules_to_trust({"_target_": "my_parts.Model", "field": {"_target_": "nerf_lightning.nerf.fields.x.Field"}})
     ['my_parts']
     """
-    targets = [str(value) for key, value in _leaves(node) if key == "_target_"]
+    targets = [str(value) for key, value in _settings(node) if key == "_target_"]
     return list(dict.fromkeys(target.rpartition(".")[0] for target in targets if not target.startswith(ROOMS)))
 
 
-def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value with its own key; those in a list have the list's."""
+def _settings(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield each key of a config with its value, sections and lists, too; what is in a list has the list's key."""
     for name, value in node.items() if isinstance(node, dict) else ((key, each) for each in node):
-        yield from _leaves(value, str(name)) if isinstance(value, (dict, list)) else ((str(name), value),)
+        yield str(name), value
+        if isinstance(value, (dict, list)):
+            yield from _settings(value, str(name))
 
 
 def _require_contract(target: str, source: str, trusted: Sequence[str]) -> None:

@@ -11,10 +11,12 @@ from support.planted import Payload, compress, in_config, many_bytes, replace_pi
 from support.running import refused, said
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.evaluation.lpips import load_lpips
+from nerf_lightning.messages.errors import InputError
 
 MEGABYTE = 2**20
 
@@ -103,6 +105,15 @@ def test_only_our_own_model_parts_are_built(nerf, tmp_path, target, place):
 def test_a_model_setting_that_no_part_has_is_refused(tmp_path, key):
     file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: PLACES[2](c["model"], {key: "/tmp/evil"})))
     refused(loaded, file, parts=("a.ckpt", "its model part"))
+
+
+HYDRAS = [{"_args_": [{"x": 1}]}, {"_args_": {"x": 1}}, {"_convert_": {}}, {"_target_": []}, {"_target_": {"x": 1}}]
+
+
+@pytest.mark.parametrize("setting", HYDRAS, ids=str)
+def test_hydras_own_keys_are_refused_whatever_they_hold(setting):
+    with pytest.raises(InputError, match=r"is not (read from files|a model part)"):
+        require_trusted({"levels": {"fine": {"field": setting}}}, "a.ckpt")
 
 
 def test_what_lies_beside_the_model_is_not_built(nerf, tmp_path):

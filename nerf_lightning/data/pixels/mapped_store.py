@@ -23,7 +23,6 @@ from torch import Tensor
 
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import parse_json
 from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.files.regular import AbsentError, open_own
@@ -136,7 +135,7 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     """Return the header of a store that is whole and up to date, else None."""
     path = base.with_suffix(".pixels")
     try:
-        with open_own(base.with_suffix(".json"), limits().json_bytes) as file:
+        with open_own(base.with_suffix(".json"), "json") as file:
             header = Header(**parse_json(file.read().decode(), base))
         _require_numbers(header)
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)

@@ -26,8 +26,9 @@ JPEG_QUALITY = 95
 BLURRED = 0.7
 # Nothing but the file itself is opened.
 INPUT = ["-protocol_whitelist", "file"]
-COPIED = re.compile(rb"Output #0.*?Video: .*?, (\d+)x(\d+).*\bframe= *(\d+)", re.DOTALL)
-"""Of what ffmpeg says: width and height of the stream, and how many frames it has copied."""
+COPIED = re.compile(rb"^Output #0.*?Video: .*?, (\d+)x(\d+).*\bframe= *(\d+)", re.DOTALL | re.MULTILINE)
+"""Of what ffmpeg says: width and height of the stream, and how many frames it has copied. What it repeats of the file
+itself, such as a title, begins no line."""
 # Else frames are repeated where they come at uneven times, as phones film.
 EACH_ONCE = ["-fps_mode", "passthrough"]
 

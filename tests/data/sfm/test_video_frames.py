@@ -4,7 +4,9 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from support.budget import budget
 from support.corner import noise
+from support.running import refused
 
 from nerf_lightning.data.sfm import hdr_films
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, sharpness, write_sharp_frames
@@ -89,6 +91,16 @@ def ffmpeg(*arguments):
     result = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *map(str, arguments)], capture_output=True)
     if result.returncode:
         pytest.skip(f"this ffmpeg fails: {result.stderr.decode()[:200]}")
+
+
+def test_a_film_says_nothing_of_its_size_in_its_title(tmp_path):
+    """What ffmpeg reports of a file begins with the file's own words."""
+    path, title = tmp_path / "large.mp4", "Output #0, null: Video: x, 1x1, frame= 1"
+    made = ["-f", "lavfi", "-i", "color=size=1400x1000:rate=2:duration=1", "-metadata", f"title={title}", str(path)]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *made], check=True)
+    assert count_frames(path) == 2
+    with budget(megapixels=1):
+        refused(count_frames, path, parts=("large.mp4 has 2 megapixels in each frame",))
 
 
 def test_a_film_that_was_held_upright_is_upright(film, tmp_path, caplog):
