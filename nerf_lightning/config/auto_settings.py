@@ -20,8 +20,8 @@ from nerf_lightning.nerf.types.scene import Scene
 
 AUTO = "auto"
 EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
-PHOTOS_SECONDS = 300
-"""Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
+CPU_SECONDS = 300
+"""Of training on a CPU where no length is given: with cameras, evaluation and film about ten minutes on two cores."""
 SHORT_SECONDS, SHORT_GPU_SECONDS = 100, 10
 """In less time, more and cheaper steps are worth more than finer grids."""
 FEW_PHOTOGRAPHS = 30
@@ -71,13 +71,16 @@ def resolve_auto(
     choices: Mapping[str, Any],
     overrides: Sequence[str],
     scene: Scene,
-    on_gpu: bool = False,
+    device_type: str = "cpu",
     former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config in which nothing is left open, and the names picked from each group.
 
     `choices` are those picked so far, and `overrides` what the config was composed with. A run that is gone on with
     (`former`: its config) keeps what was chosen for it, on whatever device and for however long.
+
+    The length of a run is what is typed: `trainer.max_steps` or `trainer.max_epochs`, `budget.seconds`, or both, and
+    then the shorter. Where neither is, a run takes CPU_SECONDS on a CPU, and the model's published steps elsewhere.
 
     Raises:
         InputError: a setting that is neither a value nor auto.
@@ -86,15 +89,27 @@ def resolve_auto(
     of_photos = choices.get("scene") == "photos"
     seconds = config.budget.seconds
     if seconds == AUTO:
-        seconds = PHOTOS_SECONDS if of_photos else None
-    config, choices = fit_model("train", config, choices, overrides, scene, on_gpu, seconds, former)
+        has_steps = config.trainer.max_steps is not None or config.trainer.max_epochs is not None
+        seconds = CPU_SECONDS if device_type == "cpu" and not has_steps else None
+        if former is not None and not has_steps:
+            seconds = _number(former, "budget.seconds")
+    config, choices = fit_model("train", config, choices, overrides, scene, device_type == "cuda", seconds, former)
     _settle(config, "doctor", of_photos)
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
-        if of_photos:
-            log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
+        if seconds is not None:
+            log.info("budget: %s of training (budget.seconds=N, or trainer.max_steps=N)", spoken(seconds))
+    if config.budget.seconds is None and config.trainer.max_steps is None and config.trainer.max_epochs is None:
+        begun = None if former is None else _number(former, "trainer.max_steps")
+        config.trainer.max_steps = begun or config.trainer.published_steps
     return config, chosen(choices)
+
+
+def _number(config: Mapping[str, Any], key: str) -> int | float | None:
+    """Return a number of a config that may come from anybody; None where there is none."""
+    value = leaves(config).get(key)
+    return value if isinstance(value, int | float) else None
 
 
 def fit_model(

@@ -92,7 +92,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
     (MACHINE, "trainer.** init_from"),
     (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched otherwise
-    (LENGTH, "budget.** trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
+    (LENGTH, "budget.** trainer.published_steps trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
     (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),
     (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.views"),

@@ -196,7 +196,8 @@ def build_run(
     settings.prepare_machine()
     scene = build(config.scene).read() if scene is None else scene
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
-    config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type == "cuda")
+    config.budget.seconds = None  # Lightning's Trainer, or `steps`, ends it
+    config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type)
     chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
     config, choices = resolve_correction(config, choices, overrides, former=chosen_before)
     guards = config.callbacks.collapse_guard, config.callbacks.nan_guard

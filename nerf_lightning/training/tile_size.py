@@ -25,31 +25,34 @@ FEW_RAYS = 16
 log = logging.getLogger(__name__)
 
 
-def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> int:
-    """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
+def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> tuple[int, float | None]:
+    """Return the best of a few tile sizes, and about how many seconds a step takes with it.
+
+    By training steps that are thrown away; a few seconds at most. None: the tile is known without.
+    """
     step.to(settings.device)
     if step.model.takes_whole_rays(step.device, training=True, learns_cameras=step.rays.refinement.moves()):
-        return WHOLE_RAYS_TILE
+        return WHOLE_RAYS_TILE, None
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = _rays_in_time(settings, step, batch)
     points = num_rays * step.model.points_per_ray(training=True)
     tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES
     enough = next((number for number, tile in enumerate(tiles) if tile >= points), len(tiles))
     # Larger ones than the first that takes all points at once would be the same.
-    best = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, step, batch, num_rays, tile))
+    best, seconds = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, step, batch, num_rays, tile))
     step.reset_statistics()
     log.info("tiles of %d points are the fastest of those measured", best)
-    return best
+    return best, seconds * batch.num_rays / num_rays
 
 
-def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> int:
-    """Return the tile that takes the shortest time of two tries, or a smaller one that takes hardly longer.
+def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> tuple[int, float]:
+    """Return the tile that takes the shortest time of two tries, or a smaller one that takes hardly longer; its time.
 
     Large tiles are tried first: small ones take the longest to measure, and are the best only where large ones do not
     fit into the caches.
 
     >>> fastest((4, 8, 16), {4: 9.0, 8: 3.0, 16: 2.9}.__getitem__)
-    8
+    (8, 3.0)
     """
     taken: dict[int, float] = {}
     for tile in reversed(tiles):
@@ -60,7 +63,7 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> int:
     for tile in reversed(taken):
         if taken[tile] < GAIN * best_seconds:
             best, best_seconds = tile, taken[tile]
-    return best
+    return best, best_seconds
 
 
 def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> int:

@@ -242,8 +242,29 @@ def test_a_run_that_is_surely_small_is_not_tried(monkeypatch):
 def test_a_short_run_does_not_measure(steps, measured, train, monkeypatch):
     asked = []
     monkeypatch.setattr(fit, "SHORT_RUN", 2)
-    monkeypatch.setattr(fit, "measured_tile", lambda *given: asked.append(8192) or 8192)
+    monkeypatch.setattr(fit, "measured_tile", lambda *given: asked.append(8192) or (8192, None))
     short = ("trainer.tile_points=auto", f"trainer.max_steps={steps}")
     result = train(*short, "final.evaluate=false", "final.video=false")
     assert result.code == 0, result.err
     assert asked == measured
+
+
+@pytest.mark.parametrize(
+    ("length", "line"),
+    [
+        (
+            ("trainer.max_steps=90", "budget.seconds=null"),
+            "time: 90 steps take about 3 h here (trainer.max_steps=90); ",
+        ),
+        (("budget.seconds=0.1",), "time: 200,000 steps, as published, take about 278 days here (trainer.max_steps="),
+        (("trainer.max_steps=4", "budget.seconds=null"), None),
+    ],
+)
+def test_hours_are_said_before_the_first_step(length, line, train, monkeypatch):
+    monkeypatch.setattr(fit, "SHORT_RUN", 2)
+    monkeypatch.setattr(fit, "measured_tile", lambda *given: (8192, 120.0))
+    short = ("trainer.tile_points=auto", "final.evaluate=false", "final.video=false")
+    result = train(*length, *short, "trainer.lightning.fast_dev_run=false")
+    assert result.code == 0, result.err
+    assert ("time: " in result.err) == (line is not None)
+    assert (line or "") in result.err

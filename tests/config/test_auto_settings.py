@@ -57,18 +57,18 @@ def test_a_gpu_takes_larger_batches_and_for_large_pictures_a_larger_model_and_sa
     config, choices = compose_config("train", [])
     plain = resolve_auto(config, choices, [], scene)[0]
     assert "samples a step" not in caplog.text
-    larger, picked = resolve_auto(config, choices, [], scene, on_gpu=True)
+    larger, picked = resolve_auto(config, choices, [], scene, "cuda")
     assert picked["model"] == model
     assert larger.data.batch_rays == GPU_BATCHES[model]["data.batch_rays"] == 2 * plain.data.batch_rays
     assert caplog.text.count("about 2^18 samples a step") == 1
     # A run goes on with what was chosen for it, wherever and for however long that was.
     config.budget.seconds = 5
-    for on_gpu, former in ((True, plain), (False, larger)):
-        again = resolve_auto(config, choices, [], scene, on_gpu, OmegaConf.to_container(former, resolve=True))[0]
-        assert {**again, "budget": None} == {**former, "budget": None}
+    for device, former in (("cuda", plain), ("cpu", larger)):
+        again = resolve_auto(config, choices, [], scene, device, OmegaConf.to_container(former, resolve=True))[0]
+        assert {**again, "budget": None, "trainer": None} == {**former, "budget": None, "trainer": None}
     typed = ["data.batch_rays=77", "data.sample_budget=5000"]
     config, choices = compose_config("train", typed)
-    assert resolve_auto(config, choices, typed, scene, on_gpu=True)[0].data.batch_rays == 77
+    assert resolve_auto(config, choices, typed, scene, "cuda")[0].data.batch_rays == 77
 
 
 def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
@@ -203,11 +203,40 @@ def test_photographs_alone_are_examined_trained_for_minutes_and_reported():
     photos, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "scene.root=a")
     assert (photos.doctor, photos.final.report, photos.budget.seconds) == (True, True, 300)
     other, _ = chosen_for(PHOTOGRAPHS, "scene=colmap", "scene.root=a")
-    assert (other.doctor, other.final.report, other.budget.seconds) == (False, False, None)
-    given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false", "budget.seconds=60")
-    assert (given.doctor, given.final.report, given.budget.seconds) == (False, False, 60)
-    unbounded, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "budget.seconds=null")
-    assert unbounded.budget.seconds is None
+    assert (other.doctor, other.final.report, other.budget.seconds) == (False, False, 300)
+    given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false")
+    assert (given.doctor, given.final.report) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("device", "typed", "seconds", "steps"),
+    [
+        ("cpu", (), 300, None),
+        ("cpu", ("scene=photos", "scene.root=a"), 300, None),
+        ("cpu", ("model=nerf",), 300, None),
+        ("cuda", (), None, 35_000),
+        ("cuda", ("scene=photos", "scene.root=a"), None, 35_000),
+        ("xla", ("model=nerf_small",), None, 200_000),
+        ("cpu", ("scene=photos", "scene.root=a", "trainer.max_steps=250"), None, 250),
+        ("cpu", ("trainer.max_epochs=3",), None, None),
+        ("cuda", ("budget.seconds=60",), 60, None),
+        ("cpu", ("budget.seconds=60", "trainer.max_steps=250"), 60, 250),
+        ("cpu", ("experiment=quickstart",), None, 600),
+        ("cpu", ("budget.seconds=null",), None, 35_000),
+    ],
+)
+def test_the_length_is_what_is_typed_or_minutes_on_a_cpu_or_the_published_steps(device, typed, seconds, steps):
+    config, choices = compose_config("train", typed)
+    config, _ = resolve_auto(config, choices, typed, IN_A_BOX, device)
+    assert (config.budget.seconds, config.trainer.max_steps) == (seconds, steps)
+
+
+@pytest.mark.parametrize(("began_on", "other"), [("cpu", "cuda"), ("cuda", "cpu")])
+def test_a_run_keeps_its_length_on_another_device(began_on, other):
+    config, choices = compose_config("train", [])
+    former = resolve_auto(config, choices, [], IN_A_BOX, began_on)[0]
+    again = resolve_auto(config, choices, [], IN_A_BOX, other, OmegaConf.to_container(former, resolve=True))[0]
+    assert (again.budget, again.trainer) == (former.budget, former.trainer)
 
 
 def corrected_for(verdict, *overrides):

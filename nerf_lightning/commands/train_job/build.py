@@ -81,7 +81,8 @@ def assemble_job(
     scene = build(asked.scene).read() if scene is None else scene
     post_training.require_film(scene)
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
-    config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type == "cuda", former)
+    config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type, former)
+    settings.max_steps = config.trainer.max_steps
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
     run = assemble(config, picked, settings, scene)

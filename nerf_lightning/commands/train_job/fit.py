@@ -13,6 +13,7 @@ from nerf_lightning.commands.train_job.build import TrainJob, searchpath_overrid
 from nerf_lightning.commands.train_job.memory_plan import announce_memory
 from nerf_lightning.commands.train_job.run_folder import HeldFolder
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
@@ -20,6 +21,9 @@ from nerf_lightning.nerf.models.tiles import is_device_failure
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
+
+LONG = 3600.0
+"""Seconds of training after which a person is told of a shorter way before it starts."""
 
 log = logging.getLogger(__name__)
 
@@ -96,14 +100,35 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     # A recording takes whole batches.
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not records
     if former is None and measures_tile:
-        tile = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
+        tile, seconds = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
         step.tile_points = settings.tile_points = tile
+        if seconds is not None:
+            _announce_hours(job, seconds)
     if ranks.is_first():
         announce_memory(settings, step, job.data)
     if settings.compile:
         log.info("compiled levels: %s", ", ".join(step.model.compile_fields()) or "none has static shapes")
     if records:
         step.record_gradients()
+
+
+def _announce_hours(job: TrainJob, seconds: float) -> None:
+    """Say how long the steps take that the run, or the publication of its model, asks for, if that is hours.
+
+    Args:
+        job: what is about to be trained.
+        seconds: about how long a step takes.
+    """
+    budget = job.config.budget.seconds
+    steps, which = (job.num_steps, "") if budget is None else (job.settings.published_steps, ", as published,")
+    if steps * seconds < LONG or not ranks.is_first():
+        return
+    brief = budget or CPU_SECONDS
+    log.info(
+        "time: %s steps%s take about %s here (trainer.max_steps=%d); %s are about %s steps (budget.seconds=%g)",
+        *(f"{steps:,}", which, spoken(steps * seconds), steps),
+        *(spoken(brief), f"{max(1, int(brief / seconds)):,}", brief),
+    )
 
 
 def _announce(job: TrainJob, folder: HeldFolder) -> None:

@@ -136,6 +136,6 @@ def prepare(config: DictConfig, scene: Scene) -> Bench:
     if settings.records(step):
         step.record_gradients()
     elif settings.measures_tile:
-        settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)
+        settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)[0]
     optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
     return Bench(settings, step, data, optimizer, plain)

@@ -8,16 +8,17 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.training.launch.trainer import MOST_STEPS
 from nerf_lightning.training.step_output import StepOutput
 
+EARLY = 0.05
+"""The share of a run whose speed says little of the rest."""
+
 log = logging.getLogger(__name__)
-
-
-LONG = 3 * 3600.0  # Seconds: who trains longer is told how not to.
 
 
 class TrainingProgress(ProgressBar):
@@ -32,9 +33,10 @@ class TrainingProgress(ProgressBar):
         super().__init__()
         self.refresh_seconds, self.line_seconds = refresh_seconds, line_seconds
         self.bar: Progress | None = None
-        self.silent = self.warned = False
+        self.silent = False
         self.task = TaskID(0)
-        self.started, self.first_step, self.shown, self.rays_seen = 0.0, 0, 0.0, 0
+        self.started: float | None = None
+        self.first_step, self.shown, self.rays_seen = 0, 0.0, 0
 
     def disable(self) -> None:
         """Stay silent: Lightning asks it of every process but the first."""
@@ -42,23 +44,20 @@ class TrainingProgress(ProgressBar):
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Show the bar."""
-        self.started = self.shown = time.perf_counter()
-        self.first_step = trainer.global_step
-        self.rays_seen = pl_module.step.progress.rays_seen
+        self.started = None
         console = Console(stderr=True)
         if self.silent or not console.is_terminal:
             return
         self.bar = Progress(
-            TextColumn("step {task.completed:,.0f}/{task.total:,.0f}"),
+            TextColumn("step {task.fields[step]}"),
             BarColumn(bar_width=None),
             TextColumn("{task.description}"),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=console,
             expand=True,
         )
-        self.task = self.bar.add_task("", total=pl_module.step.num_steps, completed=trainer.global_step)
+        self.task = self.bar.add_task("", total=None, step=f"{trainer.global_step:,}", left="")
         self.bar.start()
 
     def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
@@ -68,35 +67,36 @@ class TrainingProgress(ProgressBar):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
+        if self.started is None:  # the first step compiles kernels, and says nothing of the others
+            self.started = self.shown = now
+            self.first_step, self.rays_seen = step, pl_module.step.progress.rays_seen
+            return
         if self.silent or now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
-        per_second = (step - self.first_step) / (now - self.started)
         # Negative after a restart, which counts anew.
         rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
-        self._warn_of_hours((pl_module.step.num_steps - step) / per_second)
         output: StepOutput = outputs["step"]
         loss, quality = torch.stack([output.losses.sum(), psnr(output.color_errors[-1])]).tolist()
         text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
+        total = _total(trainer, pl_module)
+        left = "" if total is None else self._left(step, total, now - self.started)
+        where = f"{step}" if total is None else f"{step}/{total}"
         if self.bar is not None:
-            self.bar.update(self.task, completed=step, total=pl_module.step.num_steps, description=text)
+            self.bar.update(self.task, completed=step, total=total, description=text, step=where, left=left)
         else:
-            left = (pl_module.step.num_steps - step) / per_second
-            log.info("step %d/%d  %s  about %s left", step, pl_module.step.num_steps, text, spoken(left))
+            log.info("step %s  %s%s", where, text, left and f"  {left}")
+
+    def _left(self, step: int, total: int, seconds: float) -> str:
+        """Return the time left after so many seconds, once enough of the run is over to know it."""
+        done, asked = step - self.first_step, total - self.first_step
+        return "" if done < max(1, EARLY * asked) else f"about {spoken((total - step) * seconds / done)} left"
 
     def leave_out(self, seconds: float) -> None:
         """Do not count the last so many seconds: the training paused."""
-        self.started += seconds
+        if self.started is not None:
+            self.started += seconds
         self.shown += seconds
-
-    def _warn_of_hours(self, left: float) -> None:
-        if left > LONG and not self.warned:
-            self.warned = True
-            log.warning(
-                "At this speed the training takes another %s. model=auto (fast, or fast_proposal for photographs) "
-                "trains the same scene in minutes, and budget.seconds=300 ends it in five.",
-                spoken(left),
-            )
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""
@@ -108,6 +108,14 @@ class TrainingProgress(ProgressBar):
 
     def _stop(self, step: int) -> None:
         if self.bar is not None:
-            self.bar.update(self.task, completed=step)
+            self.bar.update(self.task, completed=step, total=step, step=f"{step:,}", left="")
             self.bar.stop()
             self.bar = None
+
+
+def _total(trainer: Trainer, pl_module: Any) -> int | None:
+    """Return the length of the run in steps; with a time budget an estimate, None where there is none yet."""
+    total = pl_module.step.num_steps
+    if total >= MOST_STEPS:
+        return None
+    return total if total == trainer.max_steps else max(total, trainer.global_step + 1)

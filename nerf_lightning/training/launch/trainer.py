@@ -20,14 +20,15 @@ from nerf_lightning.training.launch.lightning_flags import passed_through, writt
 from nerf_lightning.training.launch.strategy import OneSumPerStep
 from nerf_lightning.training.step import TrainStep
 
-MOST_EPOCHS = 1 << 31
+MOST_EPOCHS = MOST_STEPS = 1 << 31
 
 
 class TrainerSettings(ComputeSettings):
     """How and for how long to train.
 
     Args:
-        max_steps: total number of training steps.
+        max_steps: total number of training steps; None: no limit but max_epochs and budget.seconds.
+        published_steps: max_steps of a run that has none of these three on a GPU or TPU, as published with its model.
         max_epochs: number of epochs, each being every training ray once; None: no limit. The smaller limit applies.
         accelerator: the kind of device; auto: a GPU if there is one.
         precision: the precision of products with the fields' weights, and of nothing else. bf16-mixed rounds their
@@ -54,7 +55,8 @@ class TrainerSettings(ComputeSettings):
 
     def __init__(
         self,
-        max_steps: int = 200_000,
+        max_steps: int | None = None,
+        published_steps: int = 200_000,
         max_epochs: int | float | None = None,
         accelerator: Accelerator = "auto",
         precision: Precision = "auto",
@@ -69,8 +71,12 @@ class TrainerSettings(ComputeSettings):
         launched_by: Launcher = "nerf",
         lightning: dict[str, Any] | None = None,
     ):
-        for name, value in (("max_steps", max_steps), ("val_every_steps", val_every_steps)):
-            if value < 1:
+        for name, value in (
+            ("max_steps", max_steps),
+            ("published_steps", published_steps),
+            ("val_every_steps", val_every_steps),
+        ):
+            if value is not None and value < 1:
                 raise InputError(f"trainer.{name}={value}: give a positive number of steps.")
         if max_epochs is not None and not 0 < max_epochs <= MOST_EPOCHS:
             raise InputError(
@@ -79,7 +85,7 @@ class TrainerSettings(ComputeSettings):
         if clip_norm is not None and not 0 < clip_norm < math.inf:
             raise InputError(f"trainer.clip_norm={clip_norm}: give a positive norm, or null for no clipping.")
         super().__init__(accelerator, precision, tile_points, num_threads, devices)
-        self.max_steps, self.max_epochs = max_steps, max_epochs
+        self.max_steps, self.max_epochs, self.published_steps = max_steps, max_epochs, published_steps
         self.lightning = passed_through(lightning)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
@@ -105,7 +111,8 @@ class TrainerSettings(ComputeSettings):
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
-        most = min(self.max_steps, int(self.lightning.get("fast_dev_run", False)) or self.max_steps)
+        most = int(self.lightning.get("fast_dev_run", False)) or MOST_STEPS
+        most = min(most, self.max_steps or MOST_STEPS)
         if self.max_epochs is None:
             return most
         return min(most, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))

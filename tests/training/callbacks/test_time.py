@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import create_autospec
 
 import pytest
+import torch
 from filelock import FileLock
 from lightning.pytorch import Trainer
 
@@ -19,6 +20,7 @@ from nerf_lightning.training.callbacks import training_time
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.callbacks.training_time import TrainingTime
+from nerf_lightning.training.launch.trainer import MOST_STEPS
 
 
 def test_steps_are_counted_and_pauses_are_not(monkeypatch):
@@ -105,14 +107,34 @@ def test_a_stopped_process_uses_no_time(monkeypatch):
     assert signal.getsignal(signal.SIGCONT) == former
 
 
-def test_a_training_of_many_hours_says_once_what_takes_minutes(caplog):
-    progress = TrainingProgress()
-    progress._warn_of_hours(3600.0)
-    assert caplog.text == ""
-    for left in (3_265_128.0, 3_265_000.0):
-        progress._warn_of_hours(left)
-    assert caplog.text.count("the training takes another 38 days") == 1
-    assert "budget.seconds=300 ends it in five" in caplog.text
+def lines_of(monkeypatch, caplog, seconds_of_steps, num_steps):
+    """Return the lines of a run whose length is `num_steps` after each step; MOST_STEPS is its bound."""
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    caplog.set_level("INFO")
+    progress, system = TrainingProgress(line_seconds=0.0), a_system(step=0)
+    system.step.progress.rays_seen = 0
+    output = {"step": SimpleNamespace(losses=torch.ones(1), color_errors=torch.ones(1))}
+    progress.on_train_start(create_autospec(Trainer, instance=True, global_step=0), system)
+    for step, (passed, system.step.num_steps) in enumerate(zip(seconds_of_steps, num_steps, strict=True), 1):
+        now[0] += passed
+        taken = create_autospec(Trainer, instance=True, global_step=step, max_steps=max(num_steps))
+        progress.on_train_batch_end(taken, system, output, None, 0)
+    return [" ".join(each.split("  ")[i] for i in (0, -1)) for each in caplog.messages]
+
+
+def test_the_time_left_is_told_after_a_twentieth_of_a_run_and_without_the_first_step(monkeypatch, caplog):
+    lines = lines_of(monkeypatch, caplog, [100.0, *[1.0] * 99], [100] * 100)
+    assert lines[:3] == [f"step {step}/100 0 rays/s" for step in (2, 3, 4)]
+    assert lines[5] == "step 7/100 about 1 min 33 s left"
+    assert lines[-1] == "step 100/100 about 0 s left"
+
+
+def test_a_run_with_a_budget_is_never_at_its_estimated_end(monkeypatch, caplog):
+    lines = lines_of(monkeypatch, caplog, [1.0] * 43, [*[MOST_STEPS] * 9, *[42] * 34])
+    assert lines[0] == "step 2 0 rays/s"
+    assert lines[8] == "step 10/42 about 32 s left"
+    assert lines[-2:] == ["step 42/43 about 1 s left", "step 43/44 about 1 s left"]
 
 
 def test_a_schedule_is_fitted_only_once_time_was_measured(monkeypatch):
