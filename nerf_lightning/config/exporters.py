@@ -9,13 +9,14 @@ import yaml
 from hydra.utils import get_class
 from omegaconf import DictConfig
 
+from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import flatten, quoted
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS, backend
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 
 NO_EXPORTERS = ("evaluate", "video", "report")
 """Keys of `final` that name no exporter."""
@@ -57,5 +58,4 @@ def kernel_modules() -> list[str]:
 
 
 if __name__ == "__main__":
-    for module in kernel_modules():
-        backend(module)
+    compile_kernels(kernel_modules())

@@ -5,10 +5,12 @@ from dataclasses import replace
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import hold_to_budgets
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -60,6 +62,8 @@ def build_step(
         xla.require_static_shapes(model)
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
+    if settings.device_type == "cpu":
+        compile_kernels([f"{KERNELS}.{name}" for name in CPU_BACKENDS if name in model.kernels()])
     model.fit_to(scene)
     show_photographs(model, scene)
     correction: Correction = build(config.correction)

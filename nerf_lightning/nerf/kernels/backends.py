@@ -12,7 +12,7 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -23,11 +23,10 @@ import torch
 ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
 CPU_BACKENDS = (
-    *("hash_grid.cpu", "march.cpu", "ragged.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
-    *("render.cpu", "render.gradients", "render.dense"),
-    *("random.cpu", "histograms.cpu", "lenses.cpu"),
+    *("render.dense", "render.gradients", "render.cpu", "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
+    *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "adam.cpu"),
 )
-"""The modules that numba compiles."""
+"""The modules that numba compiles, those that take longest first."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
     *("render.cuda", "histograms.cuda", "adam.cuda", "pixels.cuda", "rays.cuda"),
@@ -54,15 +53,11 @@ def backend(module: str) -> ModuleType | None:
     """
     library = "triton" if module.endswith(".cuda") else "numba"
     try:
-        if library == "numba":
-            _configure_numba()
-        else:  # products and sums in one rounding, which triton warns of where nobody has said so
+        if library == "triton":  # products and sums in one rounding, which triton warns of where nobody has said so
             os.environ.setdefault(FP_FUSION, "1")
-        found = _imported(module)
-        if library == "numba":
-            _stamp_with_sources(found)
+        found = _imported(module) if library == "triton" else _with_cache(module)
         # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
-        with _told_if_long(library):
+        with nullcontext() if library == "numba" and _is_kept(found) else _told_if_long(library):
             try:
                 _try(found)
             except Exception:  # a damaged cache, perhaps: unpickling raises anything
@@ -76,6 +71,31 @@ def backend(module: str) -> ModuleType | None:
         return None
 
 
+def is_kept(module: str) -> bool:
+    """Return whether numba's cache has kernels of a module, compiled from the sources that there are."""
+    try:
+        return _is_kept(_with_cache(module))
+    except Exception:  # whatever `backend` will tell
+        return False
+
+
+def _is_kept(module: ModuleType) -> bool:
+    caches = [getattr(kernel._cache, "_cache_file", None) for kernel in _compiled(module)]
+    return any(cache._load_index() for cache in caches if cache is not None)
+
+
+def keeps_kernels() -> bool:
+    """Return whether other processes find in numba's cache what this one has compiled."""
+    return not _kept
+
+
+def _with_cache(module: str) -> ModuleType:
+    _configure_numba()
+    found = _imported(module)
+    _stamp_with_sources(found)
+    return found
+
+
 def _try(module: Any) -> None:
     with torch.inference_mode(False), torch.enable_grad():  # the first call may be for a picture
         module.trial()
@@ -83,7 +103,7 @@ def _try(module: Any) -> None:
 
 @contextmanager
 def _told_if_long(library: str) -> Iterator[None]:
-    """Say what takes so long, where it does: a person who has just installed the program waits for its first line."""
+    """Say what takes so long, where a compiler does: a person who has just installed the program waits for a line."""
     timer = threading.Timer(LONG_SECONDS, _tell_once, [library])
     timer.daemon = True
     timer.start()
@@ -95,7 +115,7 @@ def _told_if_long(library: str) -> Iterator[None]:
 
 @functools.cache
 def _tell_once(library: str) -> None:
-    log.info("%s compiles the kernels for this machine: up to a minute, the first time only", library)
+    log.info("%s compiles kernels for this machine: up to a minute, the first time only", library)
 
 
 def why_not(module: str) -> str:

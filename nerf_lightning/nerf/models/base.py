@@ -126,6 +126,10 @@ class Model(nn.Module, ABC):
         """Return the Euclidean norms of gradients, by round."""
         return {self.level_names[-1]: norm_of_gradients(self)}
 
+    def kernels(self) -> tuple[str, ...]:
+        """Return the modules of `nerf.kernels` that training takes on a CPU, to be compiled ahead of the first step."""
+        return ()
+
     def compile_fields(self) -> list[str]:
         """Compile the fields of rounds with static shapes (torch.compile), and return the rounds' names."""
         return []

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import has_dense_kernel, render_dense_rays, render_samples
+from nerf_lightning.nerf.kernels.render.whole_rays import DENSE, has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -37,6 +37,7 @@ class DenseLevel(Level):
     sampler: DenseSampler
     sampler_kind = DenseSampler
     replays = True
+    kernels = (DENSE, "mlp.cpu", "hash_grid.cpu", "histograms.cpu", "random.cpu", "adam.cpu")
 
     def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
         super().__init__(sampler, field)

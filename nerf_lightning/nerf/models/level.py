@@ -45,6 +45,9 @@ class Level(nn.Module):
     step_variant: Hashable = None
     """What the host has decided for the next step (`Model.step_variant`)."""
 
+    kernels: tuple[str, ...] = ()
+    """Modules of `nerf.kernels` that it takes on a CPU, where kernels know its field."""
+
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()
         if not isinstance(sampler, self.sampler_kind):

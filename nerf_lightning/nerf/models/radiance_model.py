@@ -122,6 +122,10 @@ class RadianceModel(PointField):
         for level in self._in_order():
             level.field.set_precision(matmul_precision)
 
+    def kernels(self) -> tuple[str, ...]:
+        """Return the kernels of the levels whose fields kernels know."""
+        return tuple(name for level in self._in_order() if level.field.parts() is not None for name in level.kernels)
+
     def compile_fields(self) -> list[str]:
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
         for module in self.modules():

@@ -7,6 +7,8 @@ from torch import Tensor
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.render.whole_rays import (
+    LEARNING,
+    RENDERING,
     has_kernel,
     render_samples,
     render_whole_rays,
@@ -36,6 +38,7 @@ class RaggedLevel(Level):
     sampler_kind = RaggedSampler
     has_static_shapes = False
     replays = True  # with arrays of a capacity, which no size is read for
+    kernels = (LEARNING, RENDERING, "mlp.cpu", "hash_grid.cpu", "carving.cpu", "march.cpu", "random.cpu", "adam.cpu")
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__(sampler, field)

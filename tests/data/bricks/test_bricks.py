@@ -12,7 +12,7 @@ import torch
 from nerf_lightning.data.bricks import reader as reader_module
 from nerf_lightning.data.bricks.light import DAY, cells, decode_srgb, encode_srgb, key_visible, openness, shade
 from nerf_lightning.data.bricks.parts import ALONG_X, ALONG_Z, Material, ball, block, fire_engine, rod, slope
-from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cameras
+from nerf_lightning.data.bricks.reader import DISTANCE, PACKAGED, BricksReader, bricks_cameras, packaged_pictures
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 from nerf_lightning.data.bricks.tracer import SIDES, Pinhole, Tracer
@@ -341,3 +341,13 @@ def test_wrong_arguments_are_explained(arguments: dict[str, object], message: st
     vars(reader).update(arguments)
     with pytest.raises(InputError, match=message):
         reader.read()
+
+
+def test_the_pictures_in_the_package_are_those_that_are_rendered(tracer: Tracer) -> None:
+    counts = {split: PACKAGED[split] for split in ("train", "val", "test")}
+    cameras, pictures = bricks_cameras(**counts, resolution=PACKAGED["resolution"]), packaged_pictures()
+    assert pictures.shape == (sum(counts.values()), PACKAGED["resolution"] ** 2, 4)
+    shown = [0, 107, 144]
+    views = [Pinhole(cameras.c2w[i].double().numpy(), float(cameras.focal[i, 0]), 128) for i in shown]
+    for view, picture in zip(views, pictures[shown], strict=True):
+        assert np.abs(tracer.pictures([view])[0].astype(int) - picture).max() <= 1  # other CPUs may round otherwise

@@ -6,7 +6,6 @@ What comes out for a ray does not depend on the others.
 """
 
 import math
-from collections.abc import Iterator
 from typing import no_type_check
 
 import numpy as np
@@ -35,6 +34,8 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
+FEATURES = 4
+"""Of a level of the grid that kernels are compiled for ahead; those for another number compile when first used."""
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW = np.float32(LARGEST_RAW_DENSITY)
 """The field's own bound on what its exponential is asked for."""
@@ -77,24 +78,28 @@ def render(
 
 def trial() -> None:
     """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
-    for rays, field, state, lattice, grid in trial_arguments():
-        for dtype in dtypes():
-            render(rays, field, state, lattice, grid, 1e-3, 1e-3, dtype)
+    for dtype in dtypes():
+        render(*trial_arguments(), 1e-3, 1e-3, dtype)
 
 
-def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, MarchState, Tensor, OccupancyCells]]:
-    """Yield a ray, a field, and what the ray marches through, for the widths that conf/model uses."""
+def trial_arguments() -> tuple[RayBundle, FieldParts, MarchState, Tensor, OccupancyCells]:
+    """Return a ray, a field, and what the ray marches through."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(*[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     state, lattice = MarchState(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
-    for features in (2, 4):
-        layout = hash_grid_layout(16 // features, 4, 2, 8)
-        weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
-        table = torch.zeros(layout.offsets[-1], features)
-        field = FieldParts(aabb, table, layout, 0.0, *weights, lambda rays: torch.ones(len(rays.near), 16))
-        yield rays, field, state, lattice, grid
+    layout = hash_grid_layout(4, 4, 2, 8)
+    weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
+    field = FieldParts(
+        aabb,
+        torch.zeros(layout.offsets[-1], FEATURES),
+        layout,
+        0.0,
+        *weights,
+        lambda rays: torch.ones(len(rays.near), 16),
+    )
+    return rays, field, state, lattice, grid
 
 
 def along(
@@ -179,6 +184,17 @@ def locate(world, r, t, points, s):
 
 @njit
 @no_type_check
+def fill(inputs, row, hidden, flat, begin, directions, r):
+    """Write a sample's inputs of the colors: what the density hands over, and features of the ray's direction."""
+    # Numbers one by one: with slices, numba also compiles the formatting of an error message, for seconds.
+    for c in range(hidden):
+        inputs[row, c] = flat[begin + c]
+    for c in range(directions.shape[1]):
+        inputs[row, hidden + c] = directions[r, c]
+
+
+@njit
+@no_type_check
 def is_inside(points, s):
     """Tell whether a sample lies in the unit cube, outside of which there is nothing."""
     x, y, z = points[s, 0], points[s, 1], points[s, 2]
@@ -214,7 +230,7 @@ def _render(kind, first, last, march, world, directions, hidden, table, levels, 
     # Of the samples whose colors are asked for together.
     inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
     between = np.zeros((ROWS, color_dims[:-1].sum() * size // 4), np.int32)
-    colors, given = np.zeros((ROWS, color_dims.max()), np.float32), hidden + directions.shape[1]
+    colors = np.zeros((ROWS, color_dims.max()), np.float32)
     live, waiting, asked = 0, first, 0
     while True:
         live = _go_on(march, live, ray, sample_index, light, opaque_below)
@@ -238,8 +254,7 @@ def _render(kind, first, last, march, world, directions, hidden, table, levels, 
             opacity[r] += w
             depth[r] += w * HALF * (begin[s] + stop[s])
             if alpha > least_alpha:
-                inputs[asked, :hidden] = flat[s * outer : s * outer + hidden]
-                inputs[asked, hidden:given] = directions[r]
+                fill(inputs, asked, hidden, flat, s * outer, directions, r)
                 owner[asked], weight[asked] = r, w
                 asked += 1
             if asked == ROWS:

@@ -46,6 +46,7 @@ from nerf_lightning.nerf.kernels.render.compositing import (
 from nerf_lightning.nerf.kernels.render.cpu import (
     along,
     arrays_of,
+    fill,
     interval,
     locate,
     network,
@@ -97,10 +98,10 @@ def render(
 
 def trial() -> None:
     """Run the kernels once on next to nothing, in the precision that training takes here by itself."""
-    for rays, field, state, lattice, grid in trial_arguments():
-        field.table.requires_grad_()
-        light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtypes()[-1], 1.0)
-        (light.sum() + opacity.sum() + depth.sum()).backward()
+    rays, field, state, lattice, grid = trial_arguments()
+    field.table.requires_grad_()
+    light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtypes()[-1], 1.0)
+    (light.sum() + opacity.sum() + depth.sum()).backward()
 
 
 class _Given:
@@ -268,7 +269,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     lengths, distances, rooms = np.zeros(ROWS, np.float32), np.zeros(ROWS, np.float32), new_rooms()
     inputs = np.zeros((ROWS, color_dims[0]), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
-    flat, given = sums.reshape(-1), hidden + directions.shape[1]
+    flat = sums.reshape(-1)
     size = bytes_of(kind)
     stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
     live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
@@ -289,8 +290,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
         absorb(count, flat, dims[-1], bias, False, ZERO, lengths, distances, points, numbers, rooms)
         asked += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
         for i in range(count):
-            inputs[i, :hidden] = flat[i * dims[-1] : i * dims[-1] + hidden]
-            inputs[i, hidden:given] = directions[ray[slots[i]]]
+            fill(inputs, i, hidden, flat, i * dims[-1], directions, ray[slots[i]])
         x = address(color_kept) + block * ROWS * color_stride
         round_rows(kind, address(inputs), 4 * color_dims[0], x, size * color_dims[0], ROWS, color_dims[0])
         through(kind, x, address(color_words), color_dims, y, y)
