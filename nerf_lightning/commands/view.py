@@ -9,7 +9,7 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photogra
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.viewer.auth import names_of
+from nerf_lightning.viewer.guarded_server import names_of
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals

@@ -12,10 +12,10 @@ from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
-from nerf_lightning.viewer.auth import Auth
 from nerf_lightning.viewer.camera_state import fov_that_holds
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import MOST_DEGREES, Controls
+from nerf_lightning.viewer.guarded_server import Auth, guarded_server
 from nerf_lightning.viewer.ports import address_of, free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -58,8 +58,6 @@ class Page:
         exports: Path | None = None,
     ) -> None:
         require_viser()
-        from nerf_lightning.viewer.guarded_server import guarded_server
-
         self.queue, self.photographs, self.folder = queue, photographs, folder
         self.most_height, self.training, self.exports = most_height, training, exports
         record = photographs.record

@@ -3,13 +3,13 @@
 import socket
 
 import pytest
+import viser
 from support.served_page import served
 from support.viser_client import ViserClient
 from websockets.asyncio import server as websockets_server
 from websockets.exceptions import InvalidStatus
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.viewer import guarded_server
 
 
 @pytest.fixture(scope="module")
@@ -118,12 +118,12 @@ def test_the_page_loads_nothing_from_elsewhere_and_goes_into_no_frame(page):
 
 def test_a_viser_that_serves_in_another_way_is_refused(tmp_path, monkeypatch):
     """Its guard is never asked to serve."""
-    plain, start = websockets_server.serve, guarded_server.ViserServer
+    plain, start = websockets_server.serve, viser.ViserServer
 
     def otherwise(*arguments, **options):
-        monkeypatch.setattr(websockets_server, "serve", plain)
+        websockets_server.serve = plain
         return start(*arguments, **options)
 
-    monkeypatch.setattr(guarded_server, "ViserServer", otherwise)
+    monkeypatch.setattr(viser, "ViserServer", otherwise)
     with pytest.raises(InputError, match="cannot be guarded"), served(tmp_path):
         pass

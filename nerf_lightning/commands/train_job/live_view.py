@@ -16,7 +16,7 @@ from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
-from nerf_lightning.viewer.auth import names_of
+from nerf_lightning.viewer.guarded_server import names_of
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address, tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue
