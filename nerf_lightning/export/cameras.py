@@ -16,7 +16,7 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import for_colmap
+from nerf_lightning.messages.escaping import require_printable
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
@@ -119,13 +119,17 @@ def beyond_colmap(cameras: Cameras) -> str | None:
 
 
 def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
-    """Return name -> text; views with the same intrinsics share a camera."""
+    """Return name -> text; views with the same intrinsics share a camera.
+
+    Raises:
+        InputError: a photograph's name that would end its line.
+    """
     numbers: dict[str, int] = {}
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of features (none)"]
     for view, name in enumerate(names):
         camera = numbers.setdefault(_camera(cameras, view), len(numbers) + 1)
-        # Two lines each, whatever it is called.
-        images += [f"{view + 1} {_pose(cameras, view)} {camera} {for_colmap(name)}", ""]
+        require_printable(name, f"photograph {view}")  # it ends a line
+        images += [f"{view + 1} {_pose(cameras, view)} {camera} {name}", ""]
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {text}" for text, number in numbers.items())]
     return {
         "cameras.txt": "\n".join(lines) + "\n",

@@ -1,12 +1,12 @@
 """Files of numpy's: never unpickled, and opened only if all that they hold may be unpacked."""
 
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 from numpy import ndarray
 
 from nerf_lightning.files.archives import start_of_directory
@@ -37,10 +37,3 @@ def open_npz(path: Path, cure: str) -> Iterator[Mapping[str, ndarray]]:
         file.seek(0)
         with np.load(file, allow_pickle=False) as arrays:
             yield arrays
-
-
-def read_columns(lines: Iterable[str], columns: list[int], count: int) -> Float[ndarray, "rows columns"]:
-    """Return columns of the first rows of a text of numbers."""
-    if not count:
-        return np.zeros((0, len(columns)))
-    return np.loadtxt(lines, usecols=columns, max_rows=count, ndmin=2, comments=None)

@@ -84,15 +84,6 @@ def for_csv(value: Any) -> Any:
     return f"'{for_terminal(value)}" if is_formula else for_terminal(value)
 
 
-def for_colmap(name: str) -> str:
-    r"""Return a photograph's name for COLMAP's images.txt, where it ends a line: every name that is read stays exact.
-
-    >>> for_colmap("a\u200db c.png\n2 1 0 0 0 0 0 0 1 d.png") == "a\u200db c.png\\n2 1 0 0 0 0 0 0 1 d.png"
-    True
-    """
-    return "".join(letter if is_plain(letter) else _as_in_python(letter) for letter in name)
-
-
 def terminal_width(otherwise: int) -> int:
     """Return how many columns text is wrapped to: the terminal's; where there is none, as many as are given."""
     return max(shutil.get_terminal_size((otherwise, 24)).columns, NARROWEST)
@@ -129,11 +120,7 @@ class EscapingFormatter(logging.Formatter):
 def _visible(letter: str) -> str:
     # Blanks of other widths, and what joins letters in Persian, in Indian languages and in emojis, do no harm.
     is_harmless = letter.isprintable() or letter in JOINERS or unicodedata.category(letter) == "Zs"
-    return letter if is_harmless else _as_in_python(letter)
-
-
-def _as_in_python(letter: str) -> str:
-    return letter.encode("unicode_escape").decode("ascii")
+    return letter if is_harmless else letter.encode("unicode_escape").decode("ascii")
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:

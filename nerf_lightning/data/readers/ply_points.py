@@ -7,7 +7,6 @@ import numpy as np
 
 from nerf_lightning.data.readers.colmap_files import ColmapPoints
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.numpy_files import read_columns
 from nerf_lightning.files.regular import open_regular, read_lines
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
@@ -41,7 +40,8 @@ def read_ply_points(path: Path) -> ColmapPoints:
         file.seek(body)
         if order == "ascii" and count:
             columns = [(kind.names or ()).index(axis) for axis in "xyz"]
-            positions = read_columns(read_lines(file, "ascii"), columns, count)
+            lines = read_lines(file, "ascii")
+            positions = np.loadtxt(lines, usecols=columns, max_rows=count, ndmin=2, comments=None)
         else:
             whole = min(count, (os.fstat(file.fileno()).st_size - body) // kind.itemsize)
             positions = np.empty((whole, 3))
