@@ -9,7 +9,7 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photogra
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.viewer.guarded_server import names_of
+from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
@@ -20,7 +20,7 @@ from nerf_lightning.viewer.shown_photographs import Photographs
 def run(config: DictConfig) -> None:
     """Serve the page until Ctrl-C or SIGTERM."""
     require_viser()
-    names_of(config.viewer.hosts)
+    auth = Auth(config.host, config.viewer.hosts)
     opened = open_checkpoint(config)
     record, scene = opened.checkpoint.scene, None
     if opened.model.needs_photographs:
@@ -32,9 +32,9 @@ def run(config: DictConfig) -> None:
     renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)
     renderer.warm_up()
     queue = RenderQueue(renderer)
-    where = config.host, config.port, config.max_height, config.viewer.hosts
     photographs = Photographs(record, scene, background)
-    page = Page(queue, photographs, folder, *where, exports=beside_checkpoint(opened.checkpoint.path, "export"))
+    exports = beside_checkpoint(opened.checkpoint.path, "export")
+    page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with

@@ -54,13 +54,24 @@ class Auth:
     Ports are not compared with the page's own, so tunnels work.
 
     Args:
-        host: the address that is listened on.
-        hosts: further names by which browsers find the page.
+        host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
+        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1]; their ports do not count.
+
+    Raises:
+        InputError: one of the hosts is no name.
     """
 
     def __init__(self, host: str, hosts: Sequence[str] | str | None = None):
-        self.token = secrets.token_urlsafe(32)
-        self._given = names_of(hosts)
+        self.host, self.token = host, secrets.token_urlsafe(32)
+        self._given = set[str]()
+        for each in [hosts] if isinstance(hosts, str | int) else hosts or ():
+            match = HOST.fullmatch(str(each).lower())
+            if match is None:
+                raise InputError(
+                    f"viewer.hosts: {each!r} is not the name of a machine: give names such as castle.example or "
+                    "192.168.1.5."
+                )
+            self._given.add(match[1])
         self._known = {*LOCAL, f"[{host}]" if ":" in host else host.lower(), *self._given}
 
     def refusal(self, request: "Request") -> tuple[HTTPStatus, str] | None:
@@ -87,21 +98,7 @@ class Auth:
         return f"nerf_lightning_{port}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
 
-def names_of(hosts: Sequence[str] | str | None) -> set[str]:
-    """Return the names in `viewer.hosts`, without their ports; what is no name is refused."""
-    names = set()
-    for each in [hosts] if isinstance(hosts, str | int) else hosts or ():
-        match = HOST.fullmatch(str(each).lower())
-        if match is None:
-            raise InputError(
-                f"viewer.hosts: {each!r} is not the name of a machine: give names such as castle.example or "
-                "192.168.1.5."
-            )
-        names.add(match[1])
-    return names
-
-
-def guarded_server(auth: Auth, host: str, port: int) -> "ViserServer":
+def guarded_server(auth: Auth, port: int) -> "ViserServer":
     """Start viser's server behind the guard, unless this version of it serves in a way that cannot be guarded."""
     from viser import ViserServer
     from websockets.asyncio import server as websockets_server
@@ -116,7 +113,7 @@ def guarded_server(auth: Auth, host: str, port: int) -> "ViserServer":
     websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]
     try:
         with redirect_stdout(StringIO()):  # viser prints boxes
-            server = ViserServer(host, port, label="nerf_lightning", verbose=False)
+            server = ViserServer(auth.host, port, label="nerf_lightning", verbose=False)
     finally:
         websockets_server.serve = serve  # type: ignore[misc]
     if not guarded:

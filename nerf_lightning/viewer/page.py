@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -37,10 +36,9 @@ class Page:
         queue: renders; whoever owns the page calls its `work`.
         photographs: of the capture, for frusta and comparison.
         folder: where snapshots and camera paths are written.
-        host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
+        auth: judges who may speak to the page, and says where it listens.
         port: the port, or the first to try.
         most_height: height of the finest image, in pixels.
-        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
         training: what the page may ask of the training that it shows; None: it shows none.
         exports: folder of files that people can download; None: none.
     """
@@ -50,22 +48,20 @@ class Page:
         queue: RenderQueue,
         photographs: Photographs,
         folder: Path,
-        host: str,
+        auth: Auth,
         port: int,
         most_height: int,
-        hosts: Sequence[str] | None = None,
         training: TrainingSwitch | None = None,
         exports: Path | None = None,
     ) -> None:
         require_viser()
-        self.queue, self.photographs, self.folder = queue, photographs, folder
+        self.queue, self.photographs, self.folder, self.auth = queue, photographs, folder, auth
         self.most_height, self.training, self.exports = most_height, training, exports
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages are closed while a picture is on its way to them; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self.auth = Auth(host, hosts)
-        self.server = guarded_server(self.auth, host, free_port(host, port))
+        self.server = guarded_server(auth, free_port(auth.host, port))
         self._dress(record)
         self.server.on_client_connect(queue.errors.harmless(self._welcome))
         self.server.on_client_disconnect(queue.errors.harmless(lambda client: queue.remove(client.client_id)))

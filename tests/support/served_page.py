@@ -13,6 +13,7 @@ from support.scenes import ball_scene, tiny_model
 from support.viser_client import ViserClient
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
@@ -66,14 +67,15 @@ class ServedPage:
 
 
 @contextmanager
-def served(folder: Path, record: dict | None = None, model=None, scene=None, height: int = HEIGHT, **options):
+def served(folder: Path, record: dict | None = None, model=None, scene=None, height: int = HEIGHT, hosts=(), **options):
     """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture.
 
     `scene` has the photographs, which are not at hand otherwise.
     """
     record = replace(scene_record(scene or ball_scene(num_views=4, size=16)), **(record or {}))
     queue = RenderQueue(SlicedRenderer(model or tiny_model().eval(), record, "white", 4096))
-    page = Page(queue, Photographs(record, scene, "white"), folder, "127.0.0.1", unused_port(), height, **options)
+    auth = Auth("127.0.0.1", hosts)
+    page = Page(queue, Photographs(record, scene, "white"), folder, auth, unused_port(), height, **options)
     over = threading.Event()
 
     def work() -> None:

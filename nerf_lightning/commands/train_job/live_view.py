@@ -16,7 +16,7 @@ from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
-from nerf_lightning.viewer.guarded_server import names_of
+from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address, tunnel
 from nerf_lightning.viewer.render_queue import RenderQueue
@@ -70,10 +70,9 @@ class LiveView(Callback):
     ):
         require_viser()
         require_address(host, port)
-        names_of(hosts)
         if not 0 < share < 1:
             raise InputError(f"viewer.live_view.share={share}: give a share of the time between 0 and 1, such as 0.15.")
-        self.host, self.port, self.hosts = host, port, hosts
+        self.auth, self.port = Auth(host, hosts), port
         self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
         self.page: Page | None = None
         self.credit, self.last, self.refreshed = 0.0, 0.0, 0.0
@@ -98,8 +97,8 @@ class LiveView(Callback):
         folder = Path(trainer.default_root_dir) / "viewer"
         # Other processes would wait for this one at their next step, and only for so long.
         self.switch = TrainingSwitch(can_pause=ranks.world_size() == 1)
-        where = self.host, self.port, self.max_height, self.hosts
-        self.page = Page(RenderQueue(renderer), photographs, folder, *where, self.switch)
+        queue = RenderQueue(renderer)
+        self.page = Page(queue, photographs, folder, self.auth, self.port, self.max_height, self.switch)
         self.last = self.refreshed = time.perf_counter()
         # Its token is for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
