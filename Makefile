@@ -38,18 +38,24 @@ export XLA_NEEDS
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/.ready ## Make the virtual environment and install everything
-$(VENV)/.ready: pyproject.toml constraints/torch.txt
+setup: $(VENV)/.ready ## Make the virtual environment and install everything that tests and contributors need
+$(VENV)/.ready: $(VENV)/.usable
+	@$(PIP) install -q $(PINNED) -e '.[dev]'
+	@$(VENV)/bin/python -m nerf_lightning.config.exporters
+	@touch $@
+
+# What training, viewing and photographs need.
+$(VENV)/.usable: pyproject.toml constraints/torch.txt
 	@command -v $(PYTHON) >/dev/null || { echo "make: $(PYTHON) is missing (Debian, Ubuntu: apt install python3-venv)"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' \
 		|| { echo "make: Python 3.11 to 3.13 is needed; name one with PYTHON=python3.12"; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || { echo "make: python3-venv is missing (Debian, Ubuntu: apt install python3-venv)"; exit 2; }
-	$(PIP) install -q $(PINNED) torch
-	$(PIP) install -q $(PINNED) -e '.[dev]'
-	@$(VENV)/bin/python -m nerf_lightning.config.exporters
+	@echo "installing PyTorch and what nerf_lightning needs in $(VENV): a few minutes, once"
+	@$(PIP) install -q $(PINNED) torch
+	@$(PIP) install -q $(PINNED) -e '.[viewer,colmap]'
 	@touch $@
 
-train: setup ## Train the built-in scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
+train: $(VENV)/.usable ## Train the built-in scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
 test: setup ## Run the tests, but for the exhaustive ones: five to six minutes on two cores
@@ -137,5 +143,5 @@ fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_planted_resume.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
-	rm -rf $(VENV) $(XLA_VENV) $(NERFBASELINES_VENV) build dist docs/_build docs/settings.md docs/index.md docs/api.md docs/security.md docs/contributing.md docs/changelog.md docs/extension_*.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) $(XLA_VENV) $(NERFBASELINES_VENV) build dist docs/_build docs/jupyter_execute docs/settings.md docs/index.md docs/api.md docs/security.md docs/contributing.md docs/changelog.md docs/extension_*.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 	find nerf_lightning tests -name __pycache__ -type d -exec rm -rf {} +

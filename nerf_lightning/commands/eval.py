@@ -31,5 +31,5 @@ def evaluate(config: DictConfig) -> float:
         scoring = build(config.evaluation)
         with torch.no_grad():
             metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)
-    say(*metric_lines(metrics, folder))
+    say(*metric_lines(metrics, folder, scene.pixels.has_transparency))
     return float(metrics["psnr"])

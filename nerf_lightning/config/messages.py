@@ -93,7 +93,7 @@ def _missing_plugin(message: str) -> str | None:
         return None
     kind, name = unknown.groups()[:2]
     extra = "slurm" if name == "submitit" else "sweep"
-    return f"This {kind} needs {name}, which is not installed: pip install 'nerf-lightning[{extra}]'."
+    return f"This {kind} needs {name}, which is not installed: pip install '.[{extra}]'."
 
 
 def explain(error: BaseException, command: str) -> str:

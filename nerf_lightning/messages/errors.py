@@ -31,7 +31,7 @@ def require_extra(module: str, extra: str, asked_by: str) -> Any:
         package = module.partition(".")[0].replace("skimage", "scikit-image")
         raise InputError(
             f"{asked_by} needs {package}, which is not installed or does not load here ({error}). Install it with: "
-            f"pip install 'nerf-lightning[{extra}]'"
+            f"pip install '.[{extra}]'"
         ) from error
 
 

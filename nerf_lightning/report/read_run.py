@@ -94,13 +94,16 @@ def address_from(file: Path, folder: Path) -> str:
 
 
 def _add_exports(report: Report, exported: Path, folder: Path) -> None:
-    """Link what nerf export wrote; of pages, only ours."""
+    """Link what nerf export wrote; of pages, only ours. What was written before the last checkpoint shows less."""
+    last = exported.parent / "checkpoints" / "last.ckpt"
+    since = last.stat().st_mtime if last.is_file() else 0.0
     files = [file for file in sorted(exported.glob("*")) if file.is_file() and file.suffix != ".html"]
     for file in files[:MOST_EXPORTS]:
-        size = f"{file.stat().st_size / 1e6:.2g} MB"
+        age = "" if file.stat().st_mtime >= since else ", of an earlier checkpoint"
+        size = f"{file.stat().st_size / 1e6:.2g} MB{age}"
         report.exports.append((f"{file.name} ({size})", address_from(file.absolute(), folder)))
     page = exported / "page.html"
-    if page.is_file() and is_page(page):
+    if page.is_file() and page.stat().st_mtime >= since and is_page(page):
         report.scene_page = address_from(page.absolute(), folder)
 
 

@@ -176,6 +176,6 @@ def _refused(error: type[Exception], what: str, cure: str) -> Iterator[None]:
 def _require(package: str, setting: str, extra: str) -> None:
     if importlib.util.find_spec(package) is None:
         raise InputError(
-            f"{setting} needs {package}, which is not installed: pip install 'nerf-lightning[{extra}]'. Or leave it "
+            f"{setting} needs {package}, which is not installed: pip install '.[{extra}]'. Or leave it "
             f"out: logger=tensorboard, logger=csv, or ~logger.{package}."
         )

@@ -49,7 +49,8 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     report = (exported.parent / "report.html").read_text()
     assert 'href="./export/page.html">Walk around' in report
     assert 'href="./export/transforms.json">transforms.json (0.' in report
-    last = result.out.splitlines()[-1]
+    *_, last, view = result.out.splitlines()
+    assert re.fullmatch(rf"look at it   \S*nerf view ckpt={exported.parent}", view)
     found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it: .+\."
     assert re.fullmatch(found, last), last
     assert (seen["degree"], seen["training"]) == (1, False)

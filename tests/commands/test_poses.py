@@ -44,7 +44,7 @@ def refused(result, tmp_path, *fragments):
 def test_pycolmap_absent_is_said_with_the_cure(poses, photographs, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     result = poses(f"images={photographs}")
-    refused(result, tmp_path, "pycolmap", "pip install 'nerf-lightning[colmap]'")
+    refused(result, tmp_path, "pycolmap", "pip install '.[colmap]'")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_folders_without_enough_photographs_are_named(poses, tmp_path):
     (folder / "photos").mkdir()
     (folder / "a.HEIC").touch()
     with without_heic():
-        refused(poses(f"images={folder}"), tmp_path, "holds a.HEIC. HEIC, as phones save it", "nerf-lightning[heic]")
+        refused(poses(f"images={folder}"), tmp_path, "holds a.HEIC. HEIC, as phones save it", ".[heic]")
     (folder / "a.HEIC").rename(folder / "a.cr2")
     refused(poses(f"images={folder}"), tmp_path, "only other files (.cr2)", "subfolders (photos)", "Convert raw")
     Image.new("RGB", (80, 80)).save(folder / "a.png")

@@ -70,7 +70,7 @@ def test_a_plugin_that_is_not_installed_is_named_with_its_extra(tmp_path, group,
     _, told = process.communicate(timeout=300)
     assert process.returncode == 2, told
     kind = group.partition("=")[0]
-    expected = f"nerf: This {kind} needs {plugin}, which is not installed: pip install 'nerf-lightning[{extra}]'.\n"
+    expected = f"nerf: This {kind} needs {plugin}, which is not installed: pip install '.[{extra}]'.\n"
     assert told == expected
     assert not (tmp_path / "out").exists()
 

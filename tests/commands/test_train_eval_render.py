@@ -6,6 +6,7 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
+from support.configs import composed
 from support.running import said
 from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -146,6 +147,14 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_pa
 
 # Every experiment is composed and built elsewhere; these take the longest to end.
 ARTICLES = ("lego_article", "lego_article_100")
+
+
+@pytest.mark.parametrize("experiment", [*ARTICLES, "lego_article_tpu"])
+def test_the_article_trains_on_black_for_all_its_epochs(experiment):
+    # What lego_article.yaml lists as different from the article is all that differs.
+    config = composed("train", f"experiment={experiment}")
+    assert (config.scene.cut_out, config.scene.background, config.trainer.max_steps) == (False, None, None)
+    assert config.trainer.max_epochs == (300 if experiment == "lego_article" else 1000)
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
     said(
         nerf("view", f"ckpt={finished_run}/checkpoints/last.ckpt"),
         "needs viser, which is not installed",
-        "pip install 'nerf-lightning[viewer]'",
+        "pip install '.[viewer]'",
     )
 
 

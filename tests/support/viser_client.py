@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'nerf-lightning[viewer]'")
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
 import msgspec  # noqa: E402
 import zstandard  # noqa: E402

@@ -59,7 +59,7 @@ def test_a_short_run_has_rows_too(trained):
 def test_every_logger_builds_or_names_its_extra(option):
     with pytest.raises(HydraException) if missing(option) else nullcontext() as refusal:
         assert build(composed("train", f"logger={option}").logger) is not None
-    assert refusal is None or "pip install 'nerf-lightning[" in str(refusal.value.__cause__)
+    assert refusal is None or "pip install '.[" in str(refusal.value.__cause__)
 
 
 def missing(option):
@@ -72,7 +72,7 @@ def test_a_missing_package_is_named_before_a_folder_is_taken(trained, tmp_path, 
     found = importlib.util.find_spec
     absent = ("wandb", "mlflow")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name in absent else found(name, *rest))
-    refused(trained, f"logger={logger}", parts=(package, f"nerf-lightning[{package}]", f"~logger.{package}"))
+    refused(trained, f"logger={logger}", parts=(package, f".[{package}]", f"~logger.{package}"))
     assert not (tmp_path / "run").exists()
 
 
@@ -123,7 +123,7 @@ def test_pictures_go_to_those_who_take_them_and_a_run_of_weights_and_biases_ends
 
 @pytest.mark.filterwarnings("ignore")
 def test_weights_and_biases_keeps_a_run_offline(trained, monkeypatch):
-    pytest.importorskip("wandb", reason="W&B is an extra: pip install 'nerf-lightning[wandb]'")
+    pytest.importorskip("wandb", reason="W&B is an extra: pip install '.[wandb]'")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     run = trained("logger=wandb", "callbacks.validation_pictures.every_steps=2")
@@ -136,7 +136,7 @@ def test_weights_and_biases_keeps_a_run_offline(trained, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore")
 def test_mlflow_keeps_curves_settings_and_pictures(trained):
-    mlflow = pytest.importorskip("mlflow", reason="MLflow is an extra: pip install 'nerf-lightning[mlflow]'")
+    mlflow = pytest.importorskip("mlflow", reason="MLflow is an extra: pip install '.[mlflow]'")
     run = trained("logger=mlflow", "callbacks.validation_pictures.every_steps=2")
     client = mlflow.MlflowClient(f"sqlite:///{run.folder / 'mlflow.db'}")
     (found,) = client.search_runs([client.get_experiment_by_name("nerf_lightning").experiment_id])

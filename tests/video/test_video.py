@@ -278,7 +278,7 @@ def test_colours_are_linear_and_times_alpha(tmp_path):
 
 def test_without_openexr_it_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(InputError, match=r"format=exr needs OpenEXR, .* pip install 'nerf-lightning\[exr\]'"):
+    with pytest.raises(InputError, match=r"format=exr needs OpenEXR, .* pip install '\.\[exr\]'"):
         film([ball_of()], PATH, 1 << 15, tmp_path / "out", FilmSettings(form="exr"))
     assert not (tmp_path / "out").exists()
 

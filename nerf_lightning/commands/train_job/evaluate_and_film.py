@@ -84,7 +84,7 @@ class PostTraining:
                 final = {name: metrics[name.partition("/")[2]] for name in FINAL_METRICS}
                 for logger in trainer.loggers:
                     logger.log_metrics({name: v for name, v in final.items() if v is not None}, trainer.global_step)
-                lines += metric_lines(metrics, folder)
+                lines += metric_lines(metrics, folder, scene.pixels.has_transparency)
             if self.path is not None:
                 shown_scene = shown_capture(scene)
                 show_photographs(model, shown_scene)
@@ -121,16 +121,16 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
     return replace(scene, cameras=learnt, refined=True), lines
 
 
-def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
-    """Return the lines that a person reads at the end."""
+def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) -> list[str]:
+    """Return the lines that a person reads at the end; a background shows where images have transparency."""
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
-    background = "no" if protocol["background"] == "none" else protocol["background"]
+    background = f", {protocol['background']} background" if has_transparency else ""
     fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
-        f"({metrics['num_images']} views, {background} background)",
+        f"({metrics['num_images']} views{background})",
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]

@@ -1,8 +1,12 @@
 """What a person gets to see of a training: Lightning's profile, exports of the scene, the report of the run."""
 
 import logging
+import os
+import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import fmean
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.profilers import SimpleProfiler
@@ -14,14 +18,17 @@ from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.commands.train_job.fit import resume_command
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.open_checkpoint import LoadedModel, as_known
+from nerf_lightning.config.overrides import to_type
 from nerf_lightning.doctor.examine import advice
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.results import FILES
@@ -32,6 +39,9 @@ WIDTH = 54  # Characters of an action's name
 # The path of the film, in ten seconds.
 PATH = {"num_frames": 120, "fps": 12}
 MOST_VIDEO_BYTES = 20_000_000  # Of a film in the page that follows a training
+# Of photographs: 92 steps made 21.6 dB of 16 of them, and 1,018 made 27.8.
+FEW_STEPS = 1_000
+RISING = 1.5  # dB of training PSNR in the second half of a run
 
 log = logging.getLogger(__name__)
 
@@ -53,19 +63,40 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(_result(job, target, psnr))
+        say(_result(job, target, psnr, trainer.global_step))
+    say(f"look at it   {_program()} view {to_type('ckpt', str(folder))}")
 
 
-def _result(job: TrainJob, page: Path, psnr: float | None) -> str:
+def _program() -> str:
+    """Return what a person types to start this program: its path where the environment is not activated."""
+    beside = Path(sys.executable).with_name("nerf")
+    return "nerf" if shutil.which("nerf") or not beside.is_file() else os.path.relpath(beside)
+
+
+def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
     """Return the last line: the page, what came out of the photographs, and what would improve it most."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
-    total = used + len(job.scene.left_out)
-    quality = "" if psnr is None else f"{psnr:.1f} dB on held-out photographs, "
-    longer = "train longer"
-    if seconds is not None:
-        longer = f"{resume_command(page.parent)} budget.seconds={2 * seconds:g} trains twice as long"
-    cure = advice(job.checks or ()) or f"the photographs are fine; {longer}."
-    return f"result       {page}: {quality}{used} of {total} photographs used. To improve it: {cure}"
+    total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
+    quality = "" if psnr is None else f"{psnr:.1f} dB on held-out {what}, "
+    length = (
+        f"trainer.max_steps={2 * steps}" if seconds is None else f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
+    )
+    cure = f"train longer ({resume_command(page.parent)} {length})."
+    if not _still_learns(job, page.parent, steps):
+        cure = advice(job.checks or ()) or f"the {what} are fine; {cure}"
+    return f"result       {page}: {quality}{used} of {total} {what} used. To improve it: {cure}"
+
+
+def _still_learns(job: TrainJob, folder: Path, steps: int) -> bool:
+    """Return whether more steps would help first: after few of them, or while the training error falls fast."""
+    if steps < FEW_STEPS:
+        return True
+    try:
+        _, values = read_curves(folder / "tensorboard")[f"PSNR/train_{job.system.model.level_names[-1]}"]
+    except (InputError, KeyError):  # no such logger
+        return False
+    tenth = len(values) // 10
+    return tenth > 0 and fmean(values[-tenth:]) - fmean(values[4 * tenth : 5 * tenth]) > RISING
 
 
 def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None:

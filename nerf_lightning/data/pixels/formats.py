@@ -10,7 +10,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "AVIF", "HEIF")
 HEIC_ENDINGS = (".heic", ".heif", ".hif")
 HEIC_KINDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 HEIC_CURE = (
-    "HEIC, as phones save it, needs a decoder: pip install 'nerf-lightning[heic]'. Or convert all of them to JPEG "
+    "HEIC, as phones save it, needs a decoder: pip install '.[heic]'. Or convert all of them to JPEG "
     "(`magick mogrify -format jpg *.heic`, or a phone's own export as JPEG, its setting 'most compatible'), and give "
     "their folder."
 )

@@ -34,7 +34,7 @@ class SplatsExport(SplatFitting):
             fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
         format: the file format: ply, spz (a sixth of the size) or glb (glTF with KHR_gaussian_splatting). SPZ needs
-            `pip install 'nerf-lightning[splats]'`.
+            `pip install '.[splats]'`.
         frame: upright, so that the scene is upright in viewers, or capture, the capture's own axes (GLB is always
             upright).
         longest: maximum length of the longer side of the images used for fitting, in pixels.

@@ -75,7 +75,7 @@ class MeshExport(Export):
         seen_only: remove what no training view sees, mainly interior surfaces; otherwise the mesh is closed.
         faces: maximum number of faces, by decimation; None: all, or 60,000 with a texture.
         texture: write a texture, with each texel from the views that face it most directly; `colors` is then ignored.
-            Needs `pip install 'nerf-lightning[texture]'`.
+            Needs `pip install '.[texture]'`.
         texture_size: texels along each side of the texture.
         format: the file format. PLY and OBJ use the capture's frame; GLB is one file for browsers, whose root node
             makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. STL is for printing in

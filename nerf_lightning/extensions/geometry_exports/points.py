@@ -52,7 +52,7 @@ class PointsExport(Export):
         agreement: how many of the 8 nearest views must see the same surface.
         tolerance: maximum relative difference of their depths.
         format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without
-            normals, which needs `pip install 'nerf-lightning[las]'`.
+            normals, which needs `pip install '.[las]'`.
     """
 
     num_points: int = 1_000_000

@@ -36,7 +36,7 @@ def test_no_other_decoder_is_reached():
 
 def test_heic_without_its_decoder_names_the_extra_first(tmp_path):
     (tmp_path / "a.jpg").write_bytes(HEIC)
-    with without_heic(), pytest.raises(InputError, match=r"HEIC.*: pip install 'nerf-lightning\[heic\]'\. Or convert"):
+    with without_heic(), pytest.raises(InputError, match=r"HEIC.*: pip install '\.\[heic\]'\. Or convert"):
         image_size(tmp_path / "a.jpg")
 
 

@@ -200,7 +200,7 @@ def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch):
 
     monkeypatch.setattr(errors, "import_module", absent)
     monkeypatch.setitem(sys.modules, "gsply", None)
-    with pytest.raises(InputError, match=r"SPZ .* needs gsply, .*pip install 'nerf-lightning\[splats\]'"):
+    with pytest.raises(InputError, match=r"SPZ .* needs gsply, .*pip install '\.\[splats\]'"):
         exported(tmp_path, solid(ball()), ball_scene(num_views=8, size=24), format="spz")
     monkeypatch.setattr(base, "backend", lambda module: None)
     with pytest.raises(InputError, match="Fitting splats needs numba"):
