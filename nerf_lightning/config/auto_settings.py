@@ -13,7 +13,6 @@ from omegaconf import DictConfig
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.overrides import key_of, leaves
 from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
-from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
@@ -98,8 +97,6 @@ def resolve_auto(
     _settle(config.final, "report", of_photos)
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
-        if seconds is not None:
-            log.info("budget: %s of training (budget.seconds=N, or trainer.max_steps=N)", spoken(seconds))
     if config.budget.seconds is None and config.trainer.max_steps is None and config.trainer.max_epochs is None:
         begun = None if former is None else _number(former, "trainer.max_steps")
         config.trainer.max_steps = begun or config.trainer.published_steps

@@ -50,7 +50,7 @@ def test_paths(tmp_path, monkeypatch):
     assert completed("eval", "ckpt=run/") == ["ckpt=run/checkpoints/"]
     assert completed("train", "scene.root=no") == ["scene.root=notes"]
     assert completed("table", "ru") == ["run/", "runs="]
-    assert completed("train", "trainer.max_steps=") == []
+    assert completed("train", "trainer.val_every_steps=") == []
 
 
 @pytest.fixture
