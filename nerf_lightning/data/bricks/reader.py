@@ -156,7 +156,9 @@ def render(cameras: Cameras, model: Model, pictures: UInt8[ndarray, "views pixel
     def rendered(chunk: slice) -> Rendered:
         return _render_chunk(tracer, views[chunk], None if pictures is None else pictures[chunk])
 
-    with ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
+    # Without pictures to render, numpy's calls are too short for threads, which would wait for each other.
+    threads = min(MOST_THREADS, num_cores()) if pictures is None else 1
+    with ThreadPoolExecutor(threads) as pool:
         results = pool.map(rendered, chunks)
         parts = [next(results) for _ in tracked(chunks, "rendering the bricks scene (once)")]
     return Rendered(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))

@@ -11,8 +11,8 @@ from nerf_lightning.data.bricks.light import DAY, SIDES, Light, key_visible, ope
 from nerf_lightning.data.bricks.parts import Part
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 
-TILE = 16
-"""Pixels along a tile's side: few candidates per ray, yet enough rays per call of numpy."""
+TILES = {1: 32, SIDES: 16}
+"""Pixels along a tile's side, by rays along a pixel's: few candidates per ray, yet enough rays per call of numpy."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +89,14 @@ class Tracer:
     def find(self, view: Pinhole, sides: int, solids: Solids) -> Found:
         """Return the first hits of `sides` x `sides` rays through each pixel, centered in equal squares."""
         upper, lower = view.rectangles(self.corners)
+        tile = TILES[sides]
         found = [_trace_tile(view, 0, 0, 0, sides, solids)]
-        for top in range(0, view.resolution, TILE):
-            row = (lower[:, 1] >= top) & (upper[:, 1] <= top + TILE)
-            for left in range(0, view.resolution, TILE):
-                inside = row & (lower[:, 0] >= left) & (upper[:, 0] <= left + TILE)
+        for top in range(0, view.resolution, tile):
+            row = (lower[:, 1] >= top) & (upper[:, 1] <= top + tile)
+            for left in range(0, view.resolution, tile):
+                inside = row & (lower[:, 0] >= left) & (upper[:, 0] <= left + tile)
                 if inside.any():
-                    found.append(_trace_tile(view, left, top, TILE, sides, solids.only(inside)))
+                    found.append(_trace_tile(view, left, top, tile, sides, solids.only(inside)))
         return _joined(found)
 
     def _openness(

@@ -27,6 +27,8 @@ one, in the midst of fetching, they keep a processor from looking ahead to memor
 AHEAD = 8
 """Memory is asked for the entries of a point so many points before they are used. A processor by itself looks ahead
 over two or three, and where a level does not fit into its caches it would wait most of the time."""
+FEATURES = 4
+"""Of a level: kernels are compiled for so many ahead; those for another number compile when they are first used."""
 NEAR_BYTES = 1 << 18
 """Levels up to this size are in the caches anyway."""
 SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
@@ -90,15 +92,14 @@ def point_gradient(
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing, for the widths that conf/model uses; it raises what compilers raise."""
+    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3)
-    for features in (2, 4):
-        table, grad = torch.zeros(layout.offsets[-1], features), torch.ones(4, 2 * features)
-        forward(table, points, layout)
-        add_table_gradient(table, points, grad, layout)
-        point_gradient(table, points, grad, layout)
+    table, grad = torch.zeros(layout.offsets[-1], FEATURES), torch.ones(4, 2 * FEATURES)
+    forward(table, points, layout)
+    add_table_gradient(table, points, grad, layout)
+    point_gradient(table, points, grad, layout)
 
 
 def level_arrays(layout: "HashGridLayout") -> tuple[Any, ...]:

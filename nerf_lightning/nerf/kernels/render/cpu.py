@@ -15,7 +15,7 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW as LARGEST_RAW_DENSITY
-from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
+from nerf_lightning.nerf.kernels.hash_grid.cpu import FEATURES, encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
@@ -34,8 +34,6 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
-FEATURES = 4
-"""Of a level of the grid that kernels are compiled for ahead; those for another number compile when first used."""
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW = np.float32(LARGEST_RAW_DENSITY)
 """The field's own bound on what its exponential is asked for."""
