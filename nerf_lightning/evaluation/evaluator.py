@@ -183,11 +183,11 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
     kept = scene.pixels.kept(view)
     if kept is not None:
         alpha = alpha * kept  # only what is wholly covered is scored
-    true_depth, true_normals = scene.truth.depth[part].view(shape), scene.truth.normals[part].view(*shape, 3)
+    truth = scene.truth(view)
     far = scene.far[view].expand(shape)
     _, points = picture_surface(RayGenerator(scene.cameras, scene.near, scene.far), view, picture)
     normals = normals_from_depth(points)
     return {
-        "depth_error": depth_error(picture.depth, picture.opacity, far, true_depth, alpha),
-        "normal_error": normal_error(normals, true_normals, alpha),
+        "depth_error": depth_error(picture.depth, picture.opacity, far, truth.depth.view(shape), alpha),
+        "normal_error": normal_error(normals, truth.normals.view(*shape, 3), alpha),
     }

@@ -24,7 +24,8 @@ def bricks():
 def errors(scene, found):
     """Relative errors of the distances."""
     pixels = found.pixels
-    return (found.distance / scene.truth.depth[scene.pixels.index_of(pixels.view, pixels.x, pixels.y)] - 1.0).abs()
+    depth = torch.cat([scene.truth(view).depth for view in range(len(scene.view_names))])
+    return (found.distance / depth[scene.pixels.index_of(pixels.view, pixels.x, pixels.y)] - 1.0).abs()
 
 
 def test_distances_are_those_of_the_surfaces_that_training_views_show(bricks):

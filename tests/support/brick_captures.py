@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import torch
 
-from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
+from nerf_lightning.data.bricks.cache import Pictures, cache_file, cached
 from nerf_lightning.data.bricks.parts import (
     ALONG_Z,
     BLACK,
@@ -89,18 +89,17 @@ def pool(thing: str) -> Scene:
     c2w = look_at(eyes, 0.15 * torch.randn(count, 3, generator=random), UP).float()
     cameras = pinhole_cameras(c2w, focal_from_fov(SIZE, FIELD_OF_VIEW), SIZE, SIZE)
 
-    def render() -> Rendered:
+    def render() -> Pictures:
         tracer, views = (
             Tracer(parts),
             [Pinhole(pose.double().numpy(), float(cameras.focal[0, 0]), SIZE) for pose in c2w],
         )
-        rgba = np.concatenate([tracer.pictures(views[i : i + 10]) for i in range(0, count, 10)]).reshape(-1, 4)
-        return Rendered(rgba, np.zeros(len(rgba), np.float32), np.zeros((len(rgba), 3), np.float32))
+        return np.concatenate([tracer.pictures(views[i : i + 10]) for i in range(0, count, 10)]).reshape(-1, 4)
 
     numbers = [(part.size, part.center, part.frame.tolist(), vars(part.material)) for part in parts]
     version = int.from_bytes(hashlib.sha256(repr(numbers).encode()).digest()[:6])
     file = cache_file(default_folder("bricks"), {"version": version, "size": SIZE, "count": count})
-    rgba = torch.from_numpy(cached(file, count * SIZE * SIZE, render).rgba)
+    rgba = torch.from_numpy(cached(file, count * SIZE * SIZE, render))
     return Scene(
         name=thing,
         cameras=cameras,

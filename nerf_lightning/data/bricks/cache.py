@@ -6,12 +6,11 @@ import logging
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from filelock import FileLock
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 
 from nerf_lightning.files.atomic import whole_file
@@ -19,16 +18,10 @@ from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.files.regular import open_own
 from nerf_lightning.messages.errors import InputError
 
+Pictures = UInt8[ndarray, "pixels 4"]
+"""Of all views of a generated scene, one after the other."""
+
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """The arrays of a generated scene, all views one after the other."""
-
-    rgba: UInt8[ndarray, "pixels 4"]
-    depth: Float[ndarray, "pixels"]
-    normals: Float[ndarray, "pixels 3"]
 
 
 def cache_file(folder: Path, settings: dict[str, int]) -> Path:
@@ -37,7 +30,7 @@ def cache_file(folder: Path, settings: dict[str, int]) -> Path:
     return folder / f"{key}.npz"
 
 
-def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
+def cached(path: Path, pixels: int, make: Callable[[], Pictures]) -> Pictures:
     """Return what `path` holds, a sound file of so many pixels, or make it and keep it there.
 
     Of several processes that ask at once, one makes and the others wait. A damaged file is made again. A folder that
@@ -51,32 +44,31 @@ def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
         logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered again.", path.parent, error)
         return make()
     try:
-        return _load(path, pixels) or _save(path, make())
+        kept = _load(path, pixels)
+        return _save(path, make()) if kept is None else kept
     finally:
         lock.release()
 
 
-def _load(path: Path, pixels: int) -> Rendered | None:
+def _load(path: Path, pixels: int) -> Pictures | None:
     """Return a sound file's content, or None."""
     if not path.exists():
         return None
-    sound = {"rgba": ((pixels, 4), "uint8"), "depth": ((pixels,), "float32"), "normals": ((pixels, 3), "float32")}
     try:
         with open_own(path, None) as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: np.asarray(archive[name]) for name in sound}
-        for name, array in arrays.items():
-            if (array.shape, array.dtype) != sound[name]:
-                raise ValueError(f"{name} is {array.shape} of {array.dtype}")
-        return Rendered(**arrays)
+            rgba = np.asarray(archive["rgba"])
+        if (rgba.shape, rgba.dtype) != ((pixels, 4), "uint8"):
+            raise ValueError(f"rgba is {rgba.shape} of {rgba.dtype}")
+        return rgba
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile, InputError) as error:
         logger.warning("The cached bricks scene %s is damaged (%s): it is rendered again.", path, error)
         return None
 
 
-def _save(path: Path, rendered: Rendered) -> Rendered:
+def _save(path: Path, rgba: Pictures) -> Pictures:
     try:
         with whole_file(path, mode=0o600) as part:
-            np.savez(part, **vars(rendered))
+            np.savez(part, rgba=rgba)
     except OSError as error:
         logger.warning("Cannot keep the bricks scene in %s (%s).", path.parent, error)
-    return rendered
+    return rgba

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from numpy import ndarray
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
+from nerf_lightning.data.bricks.cache import Pictures, cache_file, cached
 from nerf_lightning.data.bricks.light import DAY, Model
 from nerf_lightning.data.bricks.parts import fire_engine
 from nerf_lightning.data.bricks.solids import Solids
@@ -96,8 +95,10 @@ class BricksReader(Reader):
         folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder("bricks")
         key = {"version": RENDER_VERSION, "resolution": self.resolution, **counts, **self.model_key()}
         pixels, model = views * self.resolution**2, self.model()
-        pictures = packaged_pictures() if key == PACKAGED else None
-        rendered = cached(cache_file(folder, key), pixels, lambda: render(cameras, model, pictures))
+        if key == PACKAGED:
+            rgba = packaged_pictures()
+        else:
+            rgba = cached(cache_file(folder, key), pixels, lambda: render(cameras, model))
         corners = Solids.of(model.parts).corners().reshape(-1, 3)
         box = np.stack([corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN]).astype(np.float32)
         starts = dict(zip(counts, accumulate(counts.values(), initial=0), strict=False))
@@ -105,11 +106,11 @@ class BricksReader(Reader):
             name=self.name,
             cameras=cameras,
             pixels=PixelStore(
-                rgba=torch.from_numpy(rendered.rgba),
+                rgba=torch.from_numpy(rgba),
                 offset=torch.arange(views) * self.resolution**2,
                 width=cameras.width,
                 height=cameras.height,
-                has_transparency=bool((rendered.rgba[:, 3] < 255).any()),
+                has_transparency=bool((rgba[:, 3] < 255).any()),
             ),
             near=torch.full((views,), float(self.near)),
             far=torch.full((views,), float(self.far)),
@@ -119,7 +120,7 @@ class BricksReader(Reader):
             background=self.background,
             to_user=torch.eye(4, dtype=torch.float64),
             protocol={"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"},
-            truth=Truth(torch.from_numpy(rendered.depth), torch.from_numpy(rendered.normals)),
+            truth=ExactGeometry(cameras, model),
         )
 
     def _check(self) -> None:
@@ -134,40 +135,41 @@ class BricksReader(Reader):
         known_background(self.background)
 
 
-def packaged_pictures() -> UInt8[ndarray, "views pixels 4"]:
-    """Return the pictures of PACKAGED, bit for bit as `Tracer.pictures` renders them."""
+@dataclass(frozen=True)
+class ExactGeometry:
+    """Depth and normals of a view, traced when they are asked for."""
+
+    cameras: Cameras
+    model: Model
+
+    def __call__(self, view: int) -> Truth:
+        """Return those through the centers of a view's pixels."""
+        depth, normals = Tracer(self.model.parts, self.model.light).geometry(_pinholes(self.cameras)[view])
+        return Truth(torch.from_numpy(depth), torch.from_numpy(normals))
+
+
+def packaged_pictures() -> Pictures:
+    """Return the pictures of PACKAGED, bit for bit as `render` renders them."""
     size = PACKAGED["resolution"]
     with Image.open(Path(__file__).with_name("pictures.webp")) as sheet:
         rows = np.asarray(sheet.convert("RGBA")).reshape(-1, size, COLUMNS, size, 4)
-    return rows.transpose(0, 2, 1, 3, 4).reshape(-1, size**2, 4)
+    return rows.transpose(0, 2, 1, 3, 4).reshape(-1, 4)
 
 
-def render(cameras: Cameras, model: Model, pictures: UInt8[ndarray, "views pixels 4"] | None = None) -> Rendered:
-    """Render every view, on a few cores, with a progress bar on stderr; `pictures` are not rendered again."""
-    tracer = Tracer(model.parts, model.light)
-    resolution = int(cameras.width[0])
-    views = [
-        Pinhole(c2w.double().numpy(), float(focal[0]), resolution)
-        for c2w, focal in zip(cameras.c2w, cameras.focal, strict=True)
-    ]
-    step = max(1, CHUNK // (16 * resolution**2))
-    chunks = [slice(i, i + step) for i in range(0, len(views), step)]
-
-    def rendered(chunk: slice) -> Rendered:
-        return _render_chunk(tracer, views[chunk], None if pictures is None else pictures[chunk])
-
-    # Without pictures to render, numpy's calls are too short for threads, which would wait for each other.
-    threads = min(MOST_THREADS, num_cores()) if pictures is None else 1
-    with ThreadPoolExecutor(threads) as pool:
-        results = pool.map(rendered, chunks)
-        parts = [next(results) for _ in tracked(chunks, "rendering the bricks scene (once)")]
-    return Rendered(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+def render(cameras: Cameras, model: Model) -> Pictures:
+    """Render every view, on a few cores, with a progress bar on stderr."""
+    tracer, views = Tracer(model.parts, model.light), _pinholes(cameras)
+    step = max(1, CHUNK // (16 * views[0].resolution ** 2))
+    chunks = [views[i : i + step] for i in range(0, len(views), step)]
+    with ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
+        rendered = pool.map(tracer.pictures, chunks)
+        parts = [next(rendered) for _ in tracked(chunks, "rendering the bricks scene (once)")]
+    return np.concatenate(parts).reshape(-1, 4)
 
 
-def _render_chunk(tracer: Tracer, views: list[Pinhole], pictures: UInt8[ndarray, "views pixels 4"] | None) -> Rendered:
-    depth, normals = zip(*(tracer.geometry(view) for view in views), strict=True)
-    pictures = tracer.pictures(views) if pictures is None else pictures
-    return Rendered(pictures.reshape(-1, 4), np.concatenate(depth), np.concatenate(normals))
+def _pinholes(cameras: Cameras) -> list[Pinhole]:
+    each = zip(cameras.c2w, cameras.focal, cameras.width, strict=True)
+    return [Pinhole(c2w.double().numpy(), float(focal[0]), int(width)) for c2w, focal, width in each]
 
 
 def bricks_cameras(train: int, val: int, test: int, resolution: int) -> Cameras:

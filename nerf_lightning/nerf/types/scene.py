@@ -1,8 +1,9 @@
 """What a reader returns: cameras, pixels, and where the content lies."""
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
@@ -167,9 +168,8 @@ class PixelStore:
         return flat[start : start + width * height].view(height, width, *flat.shape[1:])
 
 
-@dataclass(frozen=True)
-class Truth:
-    """The exact geometry of each pixel, where a scene knows it. Flat like the pixel store."""
+class Truth(NamedTuple):
+    """The exact geometry of each pixel of a view, where a scene knows it, row by row."""
 
     depth: Float[Tensor, "pixels"]
     """Distance along the unit ray through the pixel's center to the first surface; inf where there is none."""
@@ -233,8 +233,8 @@ class Scene(SceneRecord):
     pixels: PixelStore
     protocol: dict[str, str]
     """How the pixels were made (downscale filter and the like), stamped on every number measured on them."""
-    truth: Truth | None
-    """Exact depth and normals, for scenes that know them."""
+    truth: Callable[[int], Truth] | None
+    """Returns exact depth and normals of a view, for scenes that know them."""
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
     """Sparse points of a reconstruction, in scene units; there may be none."""
     depths: KnownDepths | None = None

@@ -19,7 +19,7 @@ from support.malformed import MODEL, WRITERS, edit_bytes, edit_frame
 from support.planted import Payload, peak_of
 from support.posed_captures import read
 
-from nerf_lightning.data.bricks.cache import Rendered, cached
+from nerf_lightning.data.bricks.cache import cached
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
@@ -172,7 +172,7 @@ def test_pickles_in_arrays(tmp_path):
     with pytest.raises(InputError, match="Object arrays cannot be loaded"):
         read("llff", root)
     np.savez(tmp_path / "cache.npz", rgba=evil, depth=evil, normals=evil)
-    sound = Rendered(np.zeros((1, 4), np.uint8), np.zeros(1, np.float32), np.zeros((1, 3), np.float32))
+    sound = np.zeros((1, 4), np.uint8)
     assert cached(tmp_path / "cache.npz", 1, lambda: sound) is sound
     assert not mark.exists()
 
