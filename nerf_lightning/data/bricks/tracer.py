@@ -11,8 +11,8 @@ from nerf_lightning.data.bricks.light import DAY, SIDES, Light, key_visible, ope
 from nerf_lightning.data.bricks.parts import Part
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 
-TILES = {1: 32, SIDES: 16}
-"""Pixels along a tile's side, by rays along a pixel's: few candidates per ray, yet enough rays per call of numpy."""
+TILE = 16
+"""Pixels along a tile's side, twice as many with one ray a pixel: few candidates per ray, yet enough rays per call."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Tracer:
     def find(self, view: Pinhole, sides: int, solids: Solids) -> Found:
         """Return the first hits of `sides` x `sides` rays through each pixel, centered in equal squares."""
         upper, lower = view.rectangles(self.corners)
-        tile = TILES[sides]
+        tile = TILE if sides > 1 else 2 * TILE
         found = [_trace_tile(view, 0, 0, 0, sides, solids)]
         for top in range(0, view.resolution, tile):
             row = (lower[:, 1] >= top) & (upper[:, 1] <= top + tile)
