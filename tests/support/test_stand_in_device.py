@@ -179,5 +179,5 @@ def test_nothing_is_left_of_it():
     leaf = torch.ones(2, requires_grad=True)
     leaf.sum().backward()
     assert leaf.grad.device == leaf.device == torch.device("cpu")
-    with pytest.raises((AssertionError, RuntimeError), match="CUDA|NVIDIA"):
+    with pytest.raises((AssertionError, RuntimeError), match=r"CUDA|NVIDIA"):
         torch.zeros(1, device="cuda")
