@@ -43,6 +43,15 @@ def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None
             raise InputError(f"{source}: its model part holds the number {value:.3g}, which no model has.")
 
 
+def names_of(trusted: Sequence[str]) -> list[str]:
+    """Return the names below which all parts lie that may be built from a file, for Hydra to hold to.
+
+    >>> names_of(["my_parts"])[-2:]
+    ['nerf_lightning.extensions.*', 'my_parts.*']
+    """
+    return [f"{room}*" for room in (*ROOMS, *(f"{each}." for each in trusted))]
+
+
 def modules_to_trust(node: Any) -> list[str]:
     """Return the modules of the parts in a person's own config that are none of this program, each once.
 

@@ -21,9 +21,9 @@ def options_first(arguments: Sequence[str], command: str = "train") -> list[str]
     >>> options_first(["seed=1", "--cfg", "job", "model=nerf", "-m"])
     ['--cfg=job', '--multirun', 'seed=1', 'model=nerf']
     """
-    from hydra._internal.utils import get_args_parser  # imported late: `--help` needs no Hydra
+    from nerf_lightning.config.hydra_versions import options_parser  # imported late: `--help` needs no Hydra
 
-    parser = get_args_parser()
+    parser = options_parser()
     parser.error = lambda message: _refuse(message, arguments, command)  # type: ignore[method-assign]
     unasked = vars(parser.parse_args([]))
     asked = vars(parser.parse_intermixed_args(arguments))

@@ -74,14 +74,16 @@ def _signals_later() -> Iterator[None]:
 
 
 def compose_once() -> None:
-    """Let Hydra compose a command's config once: it would compose it a first time only to look for `hydra.mode`.
+    """Let Hydra 1.3 compose a command's config once: it would compose it a first time only to look for `hydra.mode`.
 
-    No yaml in conf/ sets one, so it matters only where files of the user are read.
+    No yaml in conf/ sets one, so it matters only where files of the user are read. Hydra 1.4 does so by itself.
     """
     from hydra._internal.hydra import Hydra
 
+    from nerf_lightning.config.hydra_versions import IS_1_3
+
     composed = Hydra.get_mode
-    if composed.__module__ == __name__:
+    if not IS_1_3 or composed.__module__ == __name__:
         return
 
     def get_mode(hydra: Hydra, *given: Any, **named: Any) -> Any:

@@ -131,7 +131,6 @@ def _run(command: str, arguments: list[str]) -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     # Hydra would print its own short traceback and exit with 1; we want the exceptions.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    import hydra
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
@@ -155,6 +154,7 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first, require_settings
         from nerf_lightning.cli.loading import compose_once
+        from nerf_lightning.config.hydra_versions import hydra_main
         from nerf_lightning.config.search_path import search_extensions
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments], command)
@@ -164,7 +164,7 @@ def _run(command: str, arguments: list[str]) -> None:
         sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
         compose_once()
         search_extensions()
-        run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
+        run = hydra_main(config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.runs.sweep import watched
 

@@ -42,11 +42,10 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
             "hydra/launcher=slurm submits its jobs with Slurm's srun, which is not found here. Start the sweep where "
             "srun is (a login node of the cluster), or run its jobs on this machine: hydra/launcher=parallel."
         )
-    from omegaconf import OmegaConf
-
+    from nerf_lightning.config.hydra_versions import register_resolver
     from nerf_lightning.files.made_folders import file_name
 
-    OmegaConf.register_new_resolver("file_name", file_name, replace=True)  # Hydra hands it to the jobs
+    register_resolver("file_name", file_name)  # Hydra hands it to the jobs
     # Hydra reads -m only before the overrides.
     arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, open_dict
 
+from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.config.instantiate import require_sections
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.search_path import search_extensions
@@ -64,7 +65,7 @@ def _hydra() -> Iterator[None]:
     GlobalHydra.instance().clear()
     search_extensions()
     try:
-        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        with initialize_config_dir(str(conf_folder()), **DEFAULTS):
             yield
     finally:
         GlobalHydra.instance().hydra = former  # Hydra puts a copy of the holder in place

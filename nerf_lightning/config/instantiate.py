@@ -5,9 +5,9 @@ import types
 from pydoc import locate
 from typing import Any, Literal, Union, get_args, get_origin
 
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.config.hydra_versions import instantiate
 from nerf_lightning.files.folders import conf_file
 from nerf_lightning.messages.errors import InputError
 
@@ -99,4 +99,4 @@ def _words(option: Any) -> str:
 def build(node: DictConfig) -> Any:
     """Build one node of the user's own config."""
     require_fitting_values(node, node._get_full_key(None))
-    return instantiate(node, _convert_="all")
+    return instantiate(node)

@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 from hydra.errors import HydraException
-from hydra.utils import instantiate
 
 from nerf_lightning.checkpoints.reading import Checkpoint
-from nerf_lightning.checkpoints.trusted_classes import require_trusted
+from nerf_lightning.checkpoints.trusted_classes import names_of, require_trusted
+from nerf_lightning.config.hydra_versions import instantiate
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.yaml_files import plain_yaml
@@ -35,7 +35,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     config = _config_of(checkpoint, "model", trusted)
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
-        shapes = build_model(config, checkpoint)
+        shapes = build_model(config, checkpoint, trusted)
     asked = sum(tensor.numel() for tensor in (*shapes.parameters(), *shapes.buffers()))
     held = sum(tensor.numel() for tensor in checkpoint.weights.values())
     if asked > held + SPARE_NUMBERS:
@@ -43,7 +43,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
             f"{checkpoint.path} is damaged: its config describes a model of {asked:,} numbers, and its weights are "
             f"{held:,}. Use another checkpoint."
         )
-    model = build_model(config, checkpoint)
+    model = build_model(config, checkpoint, trusted)
     checkpoint.load_weights(model)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
     # Of a point, in any layer or at the end of any encoder.
@@ -61,7 +61,7 @@ def load_correction(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Corr
         InputError: the config names anything else, or the weights do not fit.
     """
     config = _config_of(checkpoint, "correction", trusted)
-    correction = _built(config, "correction", checkpoint)
+    correction = _built(config, "correction", checkpoint, trusted)
     if not isinstance(correction, Correction):
         kind = type(correction).__name__
         raise InputError(f"{checkpoint.path}: its correction part describes a {kind}, not a correction.")
@@ -92,18 +92,18 @@ def hold_to_budgets(model: Model, where: str) -> None:
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 
-def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
+def build_model(config: dict[str, Any], checkpoint: Checkpoint, trusted: Sequence[str]) -> Model:
     """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`)."""
-    model = _built(config, "model", checkpoint)
+    model = _built(config, "model", checkpoint, trusted)
     if not isinstance(model, Model):
         raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
     return model
 
 
-def _built(config: dict[str, Any], part: str, checkpoint: Checkpoint) -> Any:
+def _built(config: dict[str, Any], part: str, checkpoint: Checkpoint, trusted: Sequence[str]) -> Any:
     try:
         require_fitting_values(config, part)
-        return instantiate(config, _convert_="all")
+        return instantiate(config, names_of(trusted))
     except HydraException as error:
         reason = " ".join(str(error.__cause__ or error).split())[:300]
         raise InputError(f"{checkpoint.path}: its {part} part cannot be built: {reason}. Use another one.") from error

@@ -122,8 +122,8 @@ def explain(error: BaseException, command: str) -> str:
             )
         return f"{part} cannot be built: {reason}. See nerf {command} --help."
     message = " ".join(str(error).split())
-    unread = re.match(r"LexerNoViableAltException: ([^=\s]+)=(.*) \^ See https", message)
-    unread = unread or re.match(r"Error parsing override '([^=\s]+)=(.*)' HydraException while evaluating", message)
+    unread = re.search(r"LexerNoViableAltException: ([^=\s]+)=(.*) \^ See https", message)
+    unread = unread or re.search(r"Error parsing override '([^=\s]+)=(.*)' HydraException while evaluating", message)
     if unread:
         key, value = unread.groups()
         return (

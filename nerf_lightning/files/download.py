@@ -4,6 +4,7 @@ import hashlib
 import http.client
 import logging
 from pathlib import Path
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
@@ -39,6 +40,8 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
                 with whole_file(target) as part:
                     part.write_bytes(content)
     except (http.client.HTTPException, OSError, ValueError) as error:
+        if isinstance(error, HTTPError):
+            error.close()  # it holds the answer
         raise InputError(
             f"Could not download {url}: {error or type(error).__name__}. Run again to try once more, or get "
             f"the file ({num_bytes} bytes) from that address by hand and put it at {target.resolve()}."

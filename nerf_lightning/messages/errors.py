@@ -31,7 +31,8 @@ def require_extra(module: str, extra: str, asked_by: str) -> Any:
         package = module.partition(".")[0].replace("skimage", "scikit-image")
         raise InputError(
             f"{asked_by} needs {package}, which is not installed or does not load here ({error}). Install it with: "
-            f"pip install '.[{extra}]'"
+            f"pip install '.[{extra}]'. Where that leaves it out, there is no wheel of {package} for this "
+            "version of Python or this kind of computer yet."
         ) from error
 
 

@@ -4,23 +4,23 @@ import argparse
 import shlex
 
 import pytest
-from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from support.running import said
 
 from nerf_lightning.cli.arguments import options_first
+from nerf_lightning.config.hydra_versions import options_parser
 from nerf_lightning.config.overrides import to_type
 
 TAKING_A_VALUE = [
     (option, (action.choices or ["x/y z"])[0])
-    for action in get_args_parser()._actions
+    for action in options_parser()._actions
     if isinstance(action, argparse._StoreAction)
     for option in action.option_strings
 ]
 SWITCHES = [
     option
-    for action in get_args_parser()._actions
+    for action in options_parser()._actions
     if isinstance(action, argparse._StoreTrueAction)
     for option in action.option_strings
 ]
@@ -41,7 +41,7 @@ def test_a_switch_takes_no_value(option):
 
 
 def _full(option):
-    words = next(action.option_strings for action in get_args_parser()._actions if option in action.option_strings)
+    words = next(action.option_strings for action in options_parser()._actions if option in action.option_strings)
     return next(word for word in words if word.startswith("--"))
 
 

@@ -23,6 +23,7 @@ from support.posed_captures import Known, read, ring, write_colmap, write_llff, 
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.doctor.check import Check
@@ -137,7 +138,7 @@ def rows(*names):
 @pytest.mark.parametrize("part", ["job_logging", "hydra_logging"])
 def test_what_is_logged_steers_no_terminal(part, capsys):
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), **DEFAULTS):
         settings = OmegaConf.to_container(compose("train", return_hydra_config=True).hydra[part])
     root = logging.getLogger()
     former = root.handlers[:], root.level

@@ -71,7 +71,7 @@ def test_a_plugin_that_is_not_installed_is_named_with_its_extra(tmp_path, group,
     assert process.returncode == 2, told
     kind = group.partition("=")[0]
     expected = f"nerf: This {kind} needs {plugin}, which is not installed: pip install '.[{extra}]'.\n"
-    assert told == expected
+    assert told.endswith(expected), told  # Hydra 1.4 first names each plugin that was hidden
     assert not (tmp_path / "out").exists()
 
 

@@ -9,6 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.config.search_path import search_extensions
 from nerf_lightning.files.folders import conf_file, conf_folder, conf_folders, option_names
 
@@ -37,7 +38,7 @@ def composed(command: str, *overrides: str) -> DictConfig:
 def _composed(command: str, overrides: tuple[str, ...]) -> DictConfig:
     GlobalHydra.instance().clear()
     search_extensions()
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), **DEFAULTS):
         return compose(command, overrides=list(overrides))
 
 

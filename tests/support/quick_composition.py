@@ -20,7 +20,7 @@ CONF = {f"file://{folder}" for folder in (ROOT / "conf", *ROOT.glob("nerf_lightn
 
 merged = ConfigLoaderImpl._compose_config_from_defaults_list
 loaded = ConfigRepository.load_config
-choices_map = defaults_list._create_interpolation_map
+choices_map = getattr(defaults_list, "_create_interpolation_map", None)  # 1.4 has none, and needs none
 
 _files: dict[str, bytes] = {}
 _lists: dict[str, DefaultsList] = {}
@@ -39,7 +39,8 @@ def install() -> None:
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once
     # Not of a source of files: Hydra loads their classes anew when it looks for plugins.
     ConfigRepository.load_config = loaded_once
-    defaults_list._create_interpolation_map = map_if_needed
+    if choices_map is not None:
+        defaults_list._create_interpolation_map = map_if_needed
 
 
 def kept() -> bytes:

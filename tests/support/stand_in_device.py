@@ -101,7 +101,7 @@ class StandInDevice:
     def lay(self, tensor: Tensor, there: bool) -> Tensor:
         """Write down where a tensor lies that was just made."""
         tensor.untyped_storage().lies_there = there  # type: ignore[attr-defined]
-        if there and tensor.dtype in DOUBLE:
+        if there and tensor.dtype in DOUBLE and not self._calls.in_quantile:
             (self.refuse if self.device.type == "mps" else self.refuse_in_step)(f"{tensor.dtype} on the device")
         return tensor
 
@@ -128,6 +128,8 @@ class _Calls(TorchFunctionMode):
         self.owner, kind = owner, owner.device.type
         # Whether what C++ makes for the call that is being handled lies on the device.
         self.on_device = False
+        # From 2.15 on torch itself computes in float64 where a quantile lies, one number.
+        self.in_quantile = False
         self.answers = {
             Tensor.device.__get__: lambda tensor: owner.device if lies_there(tensor) else torch.device("cpu"),
             Tensor.is_cuda.__get__: lambda tensor: lies_there(tensor) and kind == "cuda",
@@ -163,8 +165,10 @@ class _Calls(TorchFunctionMode):
                 return self.to(args[-1], there if device is None else device, kwargs.get("dtype"))
             if there:
                 owner.refuse_in_step("numbers are sent by way of pageable memory")
+        self.in_quantile = func in (torch.quantile, torch.nanquantile)
         with self.call_on(there):
             made = func(*args, **kwargs)
+        self.in_quantile = False
         return made if device is None and func not in MADE_OF_NUMBERS else owner.lay(made, there)
 
     def is_meant(self, device: Any) -> bool:

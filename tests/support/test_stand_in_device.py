@@ -45,8 +45,10 @@ REFUSED_IN_STEPS = {
         lambda there, host: torch.tensor([1.0, 2.0], device=there.device),
         lambda there, host: there.new_tensor([1.0, 2.0]),
         lambda there, host: there[host.long() - 1],
-        lambda there, host: there.__setitem__(0, 1.0),  # of one number: not filled, but copied
         lambda there, host: there[[0, 1]],
+        *(
+            [lambda there, host: there.__setitem__(0, 1.0)] if torch.__version__ < "2.15" else []
+        ),  # not filled, but copied
     ],
     "float64": [
         lambda there, host: there.double(),
@@ -177,5 +179,5 @@ def test_nothing_is_left_of_it():
     leaf = torch.ones(2, requires_grad=True)
     leaf.sum().backward()
     assert leaf.grad.device == leaf.device == torch.device("cpu")
-    with pytest.raises((AssertionError, RuntimeError), match="CUDA"):
+    with pytest.raises((AssertionError, RuntimeError), match=r"CUDA|NVIDIA"):
         torch.zeros(1, device="cuda")

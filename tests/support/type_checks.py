@@ -120,6 +120,7 @@ def _once_for_shapes(function: types.FunctionType) -> Callable:
         result = vars(computed).pop("result", computed)
         return function(*arguments, **named) if result is computed else result
 
+    call.__annotations__ = function.__annotations__  # from 3.14 on, wraps takes over what would make them anew
     quick = beartype(call, conf=CONF)
 
     def within(*arguments: Any, **named: Any) -> Any:

@@ -21,6 +21,7 @@ from support.running import FAST, FAST_PATH, refused
 import nerf_lightning
 from nerf_lightning import RadianceFieldSystem, RayDataModule, build_run
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.messages.errors import InputError
@@ -128,7 +129,7 @@ def test_a_run_has_the_settings_of_nerf_train(run, capture):
 
 
 def test_whoever_uses_hydra_keeps_it(run):
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with initialize_config_dir(str(conf_folder()), **DEFAULTS):
         theirs = GlobalHydra.instance().hydra
         run()
         assert GlobalHydra.instance().hydra is theirs

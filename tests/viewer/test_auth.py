@@ -1,6 +1,7 @@
 """Who may speak to the page: its own browser tabs and whoever has the token; nobody else, and no other site."""
 
 import socket
+import sys
 
 import pytest
 import viser
@@ -60,7 +61,7 @@ REQUESTS = [
     ("/", [], 400),
     ("/", ["Host: localhost", "Accept-Encoding: gzip", "Accept-Encoding: br"], 400),
     ("/" + "a" * 7000, ["Host: localhost"], 414),
-    ("/" + "a" * 300, ["Host: localhost"], 400),
+    ("/" + "a" * 300, ["Host: localhost"], 400 if sys.version_info < (3, 14) else 404),  # no file has such a name
     ("/%00", ["Host: localhost"], 404),
 ]
 

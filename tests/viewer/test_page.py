@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 import socket
 import time
 
@@ -47,7 +46,7 @@ def test_after_an_impossible_camera_the_page_draws_on(page, client, changed):
     page.still_serves()
 
 
-@pytest.mark.parametrize("raw", [b"", os.urandom(300), "a text", msgspec.msgpack.encode({"type": "NoSuchMessage"})])
+@pytest.mark.parametrize("raw", [b"", bytes(range(256)), "a text", msgspec.msgpack.encode({"type": "NoSuchMessage"})])
 def test_garbage_closes_its_client_at_most(page, client, raw):
     client.socket.send(raw)
     page.still_serves()

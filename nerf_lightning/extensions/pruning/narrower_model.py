@@ -40,10 +40,10 @@ def with_widths(checkpoint: Checkpoint, widths: Mapping[str, int]) -> str:
     return yaml.safe_dump(config, sort_keys=False)
 
 
-def shapes_of(checkpoint: Checkpoint, config: str) -> Model:
+def shapes_of(checkpoint: Checkpoint, config: str, trusted: Sequence[str]) -> Model:
     """Return the model that a changed config describes, without memory."""
     with torch.device("meta"):
-        return build_model(plain_yaml(config, "The narrower config")["model"], checkpoint)
+        return build_model(plain_yaml(config, "The narrower config")["model"], checkpoint, trusted)
 
 
 def _config(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -71,6 +71,7 @@ def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_nam
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", unknown)
     monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported")
     assert not cpu_multiplies_bfloat16.__wrapped__()
+    monkeypatch.setattr(environment, "_version", lambda name: None)  # which would be read so, too
     monkeypatch.setattr(environment.Path, "read_text", lambda *given, **options: "flags: none\n")
     monkeypatch.setattr(platform, "processor", lambda: "")
     monkeypatch.setattr(platform, "machine", lambda: "")

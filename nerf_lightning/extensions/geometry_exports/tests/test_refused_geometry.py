@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from importlib import import_module
+from importlib.util import find_spec
 
 import psutil
 import pytest
@@ -18,6 +19,7 @@ from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 
 TILE = 1 << 15
+with_xatlas = pytest.mark.skipif(find_spec("xatlas") is None, reason="xatlas is not installed (the extra texture)")
 
 
 def record(**changes):
@@ -59,7 +61,11 @@ def test_no_grid_is_laid_over_ndc_or_has_one_cell(tmp_path, exporter):
     [
         (VolumeExport(1024), r"12\.9 GB, but only 0\.8 GB of memory are available\. what\.resolution=\d+ would fit"),
         (MeshExport(2048, "tsdf"), r"2049 x 2049 x 2049 points, which takes 103\.\d GB.*what\.resolution=\d+ would"),
-        (MeshExport(texture=True, texture_size=8192), r"8192 x 8192 texels, which takes 6\.\d GB.*texture_size=\d+ w"),
+        pytest.param(
+            MeshExport(texture=True, texture_size=8192),
+            r"8192 x 8192 texels, which takes 6\.\d GB.*texture_size=\d+ w",
+            marks=with_xatlas,
+        ),
     ],
 )
 def test_what_is_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch, what, said):
@@ -96,7 +102,10 @@ def test_without_numba_a_fused_surface_is_refused(tmp_path, monkeypatch):
         exported(tmp_path, MeshExport(16, "tsdf"))
 
 
-@pytest.mark.parametrize("what", [MeshExport(10), MeshExport(10, texture=True, texture_size=64, format="obj")])
+TEXTURED = MeshExport(10, texture=True, texture_size=64, format="obj")
+
+
+@pytest.mark.parametrize("what", [MeshExport(10), pytest.param(TEXTURED, marks=with_xatlas)])
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch, what):
     def full(self, content):
         self.open("wb").close()

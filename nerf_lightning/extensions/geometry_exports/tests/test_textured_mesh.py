@@ -48,6 +48,7 @@ def checker(points):
 
 
 def exported(folder, model, scene, **settings):
+    pytest.importorskip("xatlas", reason="xatlas is not installed (the extra texture)")
     given = {"resolution": 10, "texture": True, "texture_size": 64} | settings
     return MeshExport(**given).export(model, scene, folder, TILE)
 

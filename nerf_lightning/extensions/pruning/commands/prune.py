@@ -12,7 +12,7 @@ from nerf_lightning.checkpoints.reading import LAST, Checkpoint, read_content
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.config.instantiate import require_fitting
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.config.open_checkpoint import open_checkpoint, trusted_modules
+from nerf_lightning.config.open_checkpoint import open_checkpoint
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.extensions.pruning.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.extensions.pruning.narrower_model import shapes_of, widths_of, with_widths
@@ -56,9 +56,9 @@ def run(config: DictConfig) -> float | None:
     before = widths_of(wide, list(narrowed)) if pruning.keep < 1.0 else {}
     after = {name: pruning.width(width, f"model.{name}") for name, width in before.items()}
     text = with_widths(wide, after)
-    weights = prune(model, shapes_of(wide, text), pruning, wide.scene, opened.tile_points)
+    weights = prune(model, shapes_of(wide, text, opened.trusted), pruning, wide.scene, opened.tile_points)
     narrow = replace(wide, config=text, weights=weights)
-    quantized = quantized_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
+    quantized = quantized_weights(load_model(narrow, opened.trusted), config.tables, config.drop_empty)
     tuning = fine_tuning(wide, after, config.finetune_steps)
     with filled_folder(config.paths.output_dir, beside_checkpoint(wide.path, "pruned")) as folder:
         target, run = make_folder(folder, "checkpoints") / LAST, child_of(folder, "finetuned")
