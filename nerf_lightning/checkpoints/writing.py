@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
-from nerf_lightning.files.atomic import FULL, whole_file
+from nerf_lightning.files.atomic import FULL, persistently, whole_file
 from nerf_lightning.messages.errors import InputError
 
 
@@ -36,12 +36,12 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
 
 def _keep(last: Path, previous: Path) -> None:
     """Give a checkpoint a second name, so that it has one at every moment; `previous` is replaced."""
-    previous.unlink(missing_ok=True)
+    persistently(previous.unlink, True)  # missing_ok
     try:
         os.link(last, previous)
     except OSError:
         # A file system without links. A crash right now leaves `previous` alone, which readers take then.
-        os.replace(last, previous)
+        persistently(os.replace, last, previous)
 
 
 def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:

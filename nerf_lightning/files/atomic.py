@@ -4,11 +4,13 @@ import errno
 import os
 import platform
 import re
+import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -22,6 +24,7 @@ except ImportError:  # Windows
 FULL = (errno.ENOSPC, errno.EDQUOT)
 NO_ROOM = (*FULL, errno.EFBIG)  # A file may also be larger than is allowed
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"  # Folders are shared between machines
+PATIENCE_SECONDS, PAUSE_SECONDS = 1.0, 0.05
 PART = re.compile(r"\..*\.(\d{1,9})_([0-9a-f]{8})\.nerf_lightning\.part(\.[^.]+)?", re.DOTALL)
 
 
@@ -40,13 +43,28 @@ def whole_file(path: Path, mode: int = 0o666) -> Iterator[Path]:
         part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
         with full_disk_named(path), _held(part, mode):
             yield part
-            os.replace(part, path)
+            persistently(os.replace, part, path)
     except OSError as error:
         if error.errno is not None and error.filename is None:
             error.filename = str(path)  # what is wrong with a disk is not said of any file
         raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def persistently(change: Callable[..., None], *arguments: Any) -> None:
+    """Rename or remove a file; where that is not permitted, try again for a second.
+
+    Windows does not permit it while another process has the file open: a reader of ours, a virus scanner, a backup.
+    """
+    end = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        try:
+            return change(*arguments)
+        except PermissionError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(PAUSE_SECONDS)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.key_meanings import fingerprint
 from nerf_lightning.config.overrides import key_of, leaves, to_type
-from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.atomic import persistently, whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import child_of, make_folder, require_no_way_out, require_run
 from nerf_lightning.files.regular import open_to_append, what_is
@@ -79,8 +79,8 @@ class RunFolder:
         if named is None and path.name == PREVIOUS:
             # Else the next save would put the damaged one in the place of the good one.
             with contextlib.suppress(FileNotFoundError):
-                os.replace(folder / LAST, folder / DAMAGED)
-            path = path.replace(folder / LAST)
+                persistently(os.replace, folder / LAST, folder / DAMAGED)
+            persistently(os.replace, path, path := folder / LAST)
         planned = int(number(read_note(self.path).get("num_steps")) or 0)
         return ResumePoint(path, found.step, found.precision, found.tile_points, max(found.step, planned))
 

@@ -199,7 +199,8 @@ def _pass_signals_on(sweep: Sweep) -> None:
         sweep.received = number
         stop_file(sweep.folder).touch()
         log.info("stopping: running jobs finish their step and save")
-        for record in read_records(sweep.folder):
+        # Those that train see the file. A signal also stops the others, but on Windows it would let nobody save.
+        for record in read_records(sweep.folder) if os.name == "posix" else ():
             if record.state == "running" and psutil.pid_exists(record.process):
                 os.kill(record.process, signal.SIGTERM)
 

@@ -130,7 +130,7 @@ def records_folder(sweep_folder: Path) -> Path:
 
 
 def stop_file(sweep_folder: Path) -> Path:
-    """Return the file that keeps waiting jobs from starting."""
+    """Return the file that keeps waiting jobs from starting, and lets those that train save and stop."""
     return sweep_folder / ".hydra" / "stop"
 
 

@@ -11,8 +11,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from support.running import FAST, finished, start, start_code
+from support.systems import POSIX
 
 from nerf_lightning.runs import sweep
+from nerf_lightning.runs.sweep_job import stop_file
 
 ALL_CORES = """
 import os, sys
@@ -140,17 +142,21 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
 
 
 @pytest.mark.exhaustive
-def test_ctrl_c_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
+@pytest.mark.parametrize("how", [pytest.param("Ctrl-C", marks=POSIX), "the stop file, as on Windows"])
+def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path, how):
     longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
     process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)
     for folder in ("0_seed=0", "1_seed=1"):
         wait_for_step(tmp_path / folder, 10, process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    if how == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    else:
+        stop_file(tmp_path).touch()
     code, output = finished(process)
-    assert code == 130, output
+    assert code == (130 if how == "Ctrl-C" else 1), output
     assert [row["state"] for row in table(tmp_path)] == ["stopped", "stopped"]
     assert output.count("stopped at step") == 2
-    assert f"go on with   nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output
+    assert f"resume with  nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output
     assert not (tmp_path / "2_seed=2" / "run.json").exists()
 
 

@@ -104,6 +104,36 @@ def test_a_failed_block_leaves_what_was_there_and_a_full_disk_is_said_of_its_fil
     assert [file.read_text() for file in tmp_path.iterdir()] == ["former"]
 
 
+def test_a_file_that_another_process_has_open_is_replaced_once_it_is_closed(tmp_path, monkeypatch):
+    """On Windows, where it is not permitted until then."""
+    waits, replace = [], os.replace
+
+    def refuse_twice(part, path):
+        if len(waits) < 2:
+            raise PermissionError(errno.EACCES, "Access is denied", str(path))
+        replace(part, path)
+
+    monkeypatch.setattr(atomic.time, "sleep", waits.append)
+    monkeypatch.setattr(os, "replace", refuse_twice)
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["whole"]
+    assert len(waits) == 2
+
+
+def test_what_is_refused_for_a_second_stays_refused(monkeypatch):
+    now = iter((0.0, 0.5, 0.9, 1.1))
+    monkeypatch.setattr(atomic.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(atomic.time, "sleep", lambda seconds: None)
+    with pytest.raises(PermissionError):
+        atomic.persistently(refuse, "a.txt")
+    assert list(now) == []
+
+
+def refuse(name):
+    raise PermissionError(errno.EACCES, "Access is denied", name)
+
+
 def write_half(path):
     with whole_file(path) as part:
         part.write_text("half")

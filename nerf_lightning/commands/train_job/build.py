@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -20,6 +21,7 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import former_config, job_folder
+from nerf_lightning.runs.sweep_job import stop_file
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
@@ -52,7 +54,10 @@ class TrainJob(Run):
 def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config asks for, and read its scene if none is given; nothing is written."""
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
-    return assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
+    job = assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
+    if job_folder() is not None:
+        job.signals.stop_file = stop_file(Path(HydraConfig.get().sweep.dir))
+    return job
 
 
 def assemble_job(

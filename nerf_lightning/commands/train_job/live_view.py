@@ -150,7 +150,7 @@ class LiveView(Callback):
             seconds = self.switch.pause_while(
                 page.queue.work_or_wait,
                 lambda: not page.is_empty,
-                lambda: any(each.received is not None for each in signals),
+                lambda: any(each.is_due(trainer, system) for each in signals),
             )
         finally:
             renderer.share = share

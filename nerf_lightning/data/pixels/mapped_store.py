@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from nerf_lightning.data.pixels.store import layout
-from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.atomic import persistently, whole_file
 from nerf_lightning.files.json_files import parse_json
 from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.files.regular import AbsentError, open_own
@@ -126,7 +126,7 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part), "checksum": _checksum(part)}))
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
-        about.unlink(missing_ok=True)
+        persistently(about.unlink, True)  # missing_ok
     log.info("Cached %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
     return header
 

@@ -1,7 +1,8 @@
-"""Ctrl-C, SIGTERM and the signals of schedulers: finish the step, save, stop; the run can go on to the last bit."""
+"""Ctrl-C, SIGTERM, a scheduler's signal, a sweep's stop: finish the step, save, stop; the run can go on to the bit."""
 
 import os
 import signal
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -21,6 +22,9 @@ class StopSignals(Callback):
 
     def __init__(self) -> None:
         self.received: int | None = None
+        self.stop_file: Path | None = None
+        """Asks for a stop once it is there, like SIGTERM, which on Windows would end the process at once."""
+        self.heard = False  # a signal, not only the file
         self.former: dict[int, Any] = {}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -36,16 +40,17 @@ class StopSignals(Callback):
         self._listen()
         if trainer.received_sigterm:
             trainer._signal_connector.received_sigterm = False
-            self.received = signal.SIGTERM
+            self.heard, self.received = True, signal.SIGTERM
 
-    def is_due(self, trainer: Trainer, pl_module: LightningModule) -> bool:
-        """Tell whether a signal was received."""
+    def is_due(self, trainer: Any, pl_module: Any) -> bool:
+        """Tell whether to stop."""
+        if self.received is None and self.stop_file is not None and self.stop_file.exists():
+            self.received = signal.SIGTERM
         return self.received is not None
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Stop where the step is whole, all processes at the same one."""
+        self.is_due(trainer, pl_module)
         received = int(ranks.largest(float(self.received or 0)))
         if received:
             self.received = received
@@ -62,6 +67,6 @@ class StopSignals(Callback):
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None and number == signal.SIGINT:
+        if self.heard and number == signal.SIGINT:
             os._exit(128 + number)  # an exception would be caught on the way, and the process linger
-        self.received = number
+        self.heard, self.received = True, number
