@@ -5,7 +5,7 @@ that index or size memory are checked against their range, where they are used. 
 file may hold a wrong scene, but no harm.
 """
 
-import reprlib
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -138,9 +138,13 @@ def _below(place: str, key: object) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it: shortened, and in one line.
+    """Return a value as a message shows it: in full where it is short and plain, else what kind of thing it is.
 
-    >>> shown("a"), shown({"a": [1, 2]}), shown(10**200)
-    ("'a'", "{'a': [1, 2]}", '100000000000000000...0000000000000000000')
+    >>> shown("a"), shown(3), shown({"a": 1}), shown(10**200), shown(10**5000)
+    ("'a'", '3', 'a dict', 'a number of 201 digits', 'a number of 5001 digits')
     """
-    return " ".join(reprlib.repr(value).split())[:200]
+    if isinstance(value, str):
+        return ascii(value if len(value) <= 40 else value[:40] + "...")
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return f"a number of {int(value.bit_length() * math.log10(2)) + 1} digits"
+    return str(value) if isinstance(value, (int, float, NoneType)) else f"a {type(value).__name__}"

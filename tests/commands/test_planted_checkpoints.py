@@ -199,7 +199,7 @@ RECORDS = {
     "nothing to train on": (recorded(splits={"test": (0,)}), "splits has no views to train on"),
     "an unknown key": (recorded(more=1), "more belongs to no file of this kind"),
     "an unknown word": (recorded(background="\x1b[2Jwhite"), "background is '\\x1b[2Jwhite', not white or"),
-    "another format": (state(format=[[["1"]]]), "format [[['1']]]"),
+    "another format": (state(format=[[["1"]]]), "format a list"),
 }
 
 

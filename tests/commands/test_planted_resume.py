@@ -78,7 +78,7 @@ def buffer(name, value):
 
 FAST_CASES = {
     "short moments": (at(*OPTIMIZER, "state", 0, "exp_avg", value=torch.zeros(1)), "exp_avg holds torch.float32 in"),
-    "a step that is a tensor": (at(*OPTIMIZER, "state", 0, "step", value=torch.tensor(3.0)), "step is tensor(3.)"),
+    "a step that is a tensor": (at(*OPTIMIZER, "state", 0, "step", value=torch.tensor(3.0)), "step is a Tensor"),
     "another space": (buffer("contracted.switch", torch.logical_not), "is not False"),
     "a box inside out": (buffer("sampler.grid.aabb", lambda x: x.flip(0)), "box in the model's state"),
     "cells": (buffer("sampler.grid.cells", lambda x: x + 7), "occupancy grid in the model's state"),
