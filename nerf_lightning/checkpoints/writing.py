@@ -36,7 +36,7 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
 
 def _keep(last: Path, previous: Path) -> None:
     """Give a checkpoint a second name, so that it has one at every moment; `previous` is replaced."""
-    persistently(previous.unlink, True)  # missing_ok
+    persistently(lambda: previous.unlink(missing_ok=True))
     try:
         os.link(last, previous)
     except OSError:

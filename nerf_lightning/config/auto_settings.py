@@ -104,9 +104,9 @@ def resolve_auto(
 
 
 def _number(config: Mapping[str, Any], key: str) -> int | float | None:
-    """Return a number of a config that may come from anybody; None where there is none."""
+    """Return a positive number of a config that may come from anybody; None where there is none."""
     value = leaves(config).get(key)
-    return value if isinstance(value, int | float) else None
+    return value if isinstance(value, int | float) and value > 0 else None
 
 
 def fit_model(

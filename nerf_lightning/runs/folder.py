@@ -80,7 +80,8 @@ class RunFolder:
             # Else the next save would put the damaged one in the place of the good one.
             with contextlib.suppress(FileNotFoundError):
                 persistently(os.replace, folder / LAST, folder / DAMAGED)
-            persistently(os.replace, path, path := folder / LAST)
+            persistently(os.replace, path, folder / LAST)
+            path = folder / LAST
         planned = int(number(read_note(self.path).get("num_steps")) or 0)
         return ResumePoint(path, found.step, found.precision, found.tile_points, max(found.step, planned))
 

@@ -63,7 +63,8 @@ def build_step(
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     if settings.device_type == "cpu":
-        compile_kernels([f"{KERNELS}.{name}" for name in CPU_BACKENDS if name in model.kernels()])
+        taken = model.kernels()
+        compile_kernels([f"{KERNELS}.{name}" for name in CPU_BACKENDS if name in taken])
     model.fit_to(scene)
     show_photographs(model, scene)
     correction: Correction = build(config.correction)

@@ -144,7 +144,7 @@ class ExactGeometry:
 
     def __call__(self, view: int) -> Truth:
         """Return those through the centers of a view's pixels."""
-        depth, normals = Tracer(self.model.parts, self.model.light).geometry(_pinholes(self.cameras)[view])
+        depth, normals = Tracer(self.model.parts, self.model.light).geometry(_pinhole(self.cameras, view))
         return Truth(torch.from_numpy(depth), torch.from_numpy(normals))
 
 
@@ -158,7 +158,8 @@ def packaged_pictures() -> Pictures:
 
 def render(cameras: Cameras, model: Model) -> Pictures:
     """Render every view, on a few cores, with a progress bar on stderr."""
-    tracer, views = Tracer(model.parts, model.light), _pinholes(cameras)
+    tracer = Tracer(model.parts, model.light)
+    views = [_pinhole(cameras, view) for view in range(len(cameras.c2w))]
     step = max(1, CHUNK // (16 * views[0].resolution ** 2))
     chunks = [views[i : i + step] for i in range(0, len(views), step)]
     with ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
@@ -167,9 +168,8 @@ def render(cameras: Cameras, model: Model) -> Pictures:
     return np.concatenate(parts).reshape(-1, 4)
 
 
-def _pinholes(cameras: Cameras) -> list[Pinhole]:
-    each = zip(cameras.c2w, cameras.focal, cameras.width, strict=True)
-    return [Pinhole(c2w.double().numpy(), float(focal[0]), int(width)) for c2w, focal, width in each]
+def _pinhole(cameras: Cameras, view: int) -> Pinhole:
+    return Pinhole(cameras.c2w[view].double().numpy(), float(cameras.focal[view, 0]), int(cameras.width[view]))
 
 
 def bricks_cameras(train: int, val: int, test: int, resolution: int) -> Cameras:

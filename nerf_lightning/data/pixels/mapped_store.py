@@ -126,7 +126,7 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part), "checksum": _checksum(part)}))
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
-        persistently(about.unlink, True)  # missing_ok
+        persistently(lambda: about.unlink(missing_ok=True))
     log.info("Cached %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
     return header
 

@@ -118,4 +118,4 @@ def _total(trainer: Trainer, pl_module: Any) -> int | None:
     total = pl_module.step.num_steps
     if total >= MOST_STEPS:
         return None
-    return total if total == trainer.max_steps else max(total, trainer.global_step + 1)
+    return total if total >= trainer.estimated_stepping_batches else max(total, trainer.global_step + 1)

@@ -118,7 +118,7 @@ def lines_of(monkeypatch, caplog, seconds_of_steps, num_steps):
     progress.on_train_start(create_autospec(Trainer, instance=True, global_step=0), system)
     for step, (passed, system.step.num_steps) in enumerate(zip(seconds_of_steps, num_steps, strict=True), 1):
         now[0] += passed
-        taken = create_autospec(Trainer, instance=True, global_step=step, max_steps=max(num_steps))
+        taken = create_autospec(Trainer, instance=True, global_step=step, estimated_stepping_batches=max(num_steps))
         progress.on_train_batch_end(taken, system, output, None, 0)
     return [" ".join(each.split("  ")[i] for i in (0, -1)) for each in caplog.messages]
 
