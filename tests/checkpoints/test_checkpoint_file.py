@@ -5,6 +5,7 @@ import os
 import pytest
 import torch
 from support.running import start_code
+from support.systems import POSIX
 
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.files.atomic import MACHINE
@@ -50,6 +51,7 @@ def test_whatever_fails_the_former_one_is_there(tmp_path, monkeypatch, function)
         assert steps(tmp_path) == {"last.ckpt": 3, "previous.ckpt": 2}
 
 
+@POSIX
 def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
     """A real limit on the size of files, in a process of its own."""
     path = tmp_path / "checkpoints" / "last.ckpt"

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 from support.captures import picture, pose
 from support.running import FAST, said, saved, start, start_code
+from support.systems import POSIX
 
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.messages.errors import InputError
@@ -119,6 +120,7 @@ def never_killed(phase, places, out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
+@POSIX
 def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(name, places, tmp_path):
     phase, out, (amid, largest) = PHASES[name], tmp_path / "out", QUICK[name]
     wanted, _ = never_killed(phase, places, tmp_path / "never")
@@ -134,6 +136,7 @@ def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given
 @pytest.mark.slow
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", PHASES)
+@POSIX
 def test_a_command_that_is_killed_at_50_moments_ends_the_same(name, places, tmp_path):
     phase, killed = PHASES[name], 0
     wanted, seconds = never_killed(phase, places, tmp_path / "never")
@@ -175,6 +178,7 @@ def once_saved(process, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("logger", ["tensorboard", pytest.param("none", marks=pytest.mark.exhaustive)])
+@POSIX
 def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, tmp_path):
     process = train(capture, tmp_path / "run", 2000, f"logger={logger}")
     once_saved(process, tmp_path / "run")

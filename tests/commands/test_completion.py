@@ -1,7 +1,6 @@
 """What the shells complete: asked in each shell itself, where it is installed."""
 
 import os
-import pty
 import select
 import shutil
 import subprocess
@@ -10,6 +9,7 @@ import time
 
 import pytest
 from support.running import REPOSITORY, said
+from support.systems import POSIX
 
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
 from nerf_lightning.config.manual.candidates import candidates
@@ -74,7 +74,10 @@ LOAD = 'eval "$(nerf completion {0})"; echo RE"A"DY\n'
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [shell("bash"), shell("zsh")])
+@POSIX
 def test_a_key_press_completes_what_was_typed(name, path, tmp_path):
+    import pty  # not on Windows
+
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(tmp_path)

@@ -6,6 +6,7 @@ import time
 import pytest
 import torch
 from support.running import FAST, FAST_PATH, finished, saved, start
+from support.systems import POSIX
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
 STEPS = 70
@@ -33,6 +34,7 @@ def flat(value, path=""):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
+@POSIX
 def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads):
     """Weights, moments, occupancy grid, rays per step and per pixel: all of it."""
     # Several rays a pixel from step 21 on: between the two places at which it is stopped.

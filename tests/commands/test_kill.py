@@ -8,7 +8,9 @@ import pytest
 import torch
 from support.killed_runs import PLACES
 from support.running import FAST, start_code
+from support.systems import POSIX
 
+pytestmark = POSIX
 STEPS = 36
 # A start of such a run lasts a second or so once everything is imported.
 LONGEST = 1.2

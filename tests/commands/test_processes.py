@@ -9,6 +9,7 @@ import pytest
 import torch
 from support.ports import unused_port
 from support.running import FAST, FAST_PATH, finished, said, saved, start, start_code, start_cold
+from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import processes
@@ -78,6 +79,7 @@ def test_two_machines_under_torchrun_follow_one_process(capture, tmp_path, alone
 
 
 @pytest.mark.exhaustive
+@POSIX
 def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path, alone):
     process = start(*arguments(capture, *TWO, f"paths.output_dir={tmp_path}"))
     while process.poll() is None and saved(tmp_path)["global_step"] < STEPS // 2:
@@ -106,6 +108,7 @@ time.sleep(60)
 """
 
 
+@POSIX
 def test_a_worker_ends_with_the_process_that_has_started_it():
     with start_code(ORPHANED) as process:
         worker = psutil.Process(int(process.stdout.readline()))
@@ -117,6 +120,7 @@ def test_a_worker_ends_with_the_process_that_has_started_it():
 
 
 @pytest.mark.exhaustive
+@POSIX
 def test_workers_end_with_the_process_that_has_started_them(capture, tmp_path):
     process = start(*arguments(capture, *TWO, "trainer.max_steps=1000000", f"paths.output_dir={tmp_path}"))
     while process.poll() is None and saved(tmp_path)["global_step"] == 0:

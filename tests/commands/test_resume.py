@@ -10,6 +10,7 @@ import time
 import pytest
 import torch
 from support.running import FAST, finished, saved, start
+from support.systems import POSIX
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerf_lightning.compute.slurm import requeue, slurm_job, was_requeued
@@ -48,6 +49,7 @@ def never_stopped(capture, tmp_path_factory):
 
 
 @pytest.mark.slow
+@POSIX
 def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped):
     """The command that a stopped run prints: no override needs to be repeated. TensorBoard shows each step once."""
     folder = tmp_path / "run"
@@ -146,6 +148,7 @@ def test_a_first_start_was_not_requeued(monkeypatch):
     assert not was_requeued()
 
 
+@POSIX
 def test_usr1_requeues_and_sigterm_does_not(scontrol):
     for number, asked in ((signal.SIGTERM, []), (signal.SIGUSR1, ["requeue 4711"])):
         before = signal.getsignal(number)
@@ -168,6 +171,7 @@ def test_one_process_asks_for_all_and_a_refusal_by_slurm_is_told(scontrol, monke
     assert "scontrol requeue 4711 failed: Job may not be requeued. Submit the job again by hand" in caplog.text
 
 
+@POSIX
 def test_submitits_own_handler_is_called_after_the_run_has_saved(monkeypatch):
     monkeypatch.setenv("SUBMITIT_EXECUTOR", "slurm")
     called = []
@@ -181,6 +185,7 @@ def test_submitits_own_handler_is_called_after_the_run_has_saved(monkeypatch):
 
 
 @pytest.mark.slow
+@POSIX
 def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_again(capture, tmp_path, scontrol):
     root = tmp_path / "runs"
     process = begin(capture, root)
@@ -200,6 +205,7 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
 
 
 @pytest.mark.exhaustive
+@POSIX
 def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path):
     folder = tmp_path / "sweep"
     process = begin(

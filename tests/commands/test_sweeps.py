@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from support.running import FAST, finished, start, start_code
 from support.systems import POSIX
 
+from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.runs import sweep
 from nerf_lightning.runs.sweep_job import stop_file
 
@@ -76,7 +77,7 @@ def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, 
     assert f"{psnr[0]:.2f}" in lines[2]
     assert f"{psnr[0]:.2f}" in output
     if launcher == "parallel":
-        assert output.count(f"cpu, {max(1, len(os.sched_getaffinity(0)) // 2)} threads") == 2
+        assert output.count(f"cpu, {max(1, num_cores() // 2)} threads") == 2
         for number in (0, 1):
             assert f"[{number + 1}/2 seed={number}] test PSNR" in output
             assert f"INFO  [{number + 1}/2 seed={number}] run folder" in output
@@ -121,6 +122,7 @@ def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
 
 
 @pytest.mark.slow
+@POSIX
 def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     longer = ("seed=0,1", "trainer.max_steps=80")
     process = start(*arguments(capture, tmp_path, *longer))
@@ -161,6 +163,7 @@ def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path, h
 
 
 @pytest.mark.slow
+@POSIX
 def test_sigterm_stops_the_sweep_and_not_only_its_job(capture, tmp_path):
     process = start(*arguments(capture, tmp_path, "seed=0,1", "trainer.max_steps=100000"))
     wait_for_step(tmp_path / "0_seed=0", 10, process)

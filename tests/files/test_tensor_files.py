@@ -10,6 +10,7 @@ import pytest
 import torch
 from support.planted import replace_pickle, write_checkpoint
 from support.running import refused
+from support.systems import POSIX
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
@@ -174,6 +175,7 @@ def test_lists_in_lists_without_end_are_refused(tmp_path):
         refused(read_checkpoint, path, parts=("a.ckpt",))
 
 
+@POSIX
 def test_what_lies_in_the_place_of_a_checkpoint_is_named(tmp_path):
     os.mkfifo(tmp_path / "last.ckpt")
     refused(read_checkpoint, tmp_path / "last.ckpt", parts=("last.ckpt is a named pipe (FIFO)",))

@@ -5,6 +5,7 @@ import logging
 
 import pytest
 from support.running import refused, start_code
+from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import output_folder
@@ -66,6 +67,7 @@ print("went on")
 """
 
 
+@POSIX
 def test_a_full_disk_costs_lines_alone(tmp_path):
     process = start_code(FULL, str(tmp_path))
     output, errors = process.communicate(timeout=300)

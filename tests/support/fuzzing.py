@@ -1,7 +1,6 @@
 """How a test tries many damaged files: how many, and what each may do."""
 
 import os
-import resource
 import signal
 import sys
 import warnings
@@ -68,6 +67,11 @@ def harmless(read: Callable[..., Any], *arguments: Any, **settings: Any) -> Any:
 
 @contextmanager
 def _bounded() -> Iterator[None]:
+    if os.name != "posix":
+        yield
+        return
+    import resource  # not on Windows
+
     def stop(*_: object) -> None:
         raise Hang(f"more than {SECONDS} s")
 

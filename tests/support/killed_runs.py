@@ -15,7 +15,6 @@ import importlib
 import io
 import json
 import os
-import resource
 import signal
 import sys
 import threading
@@ -113,6 +112,8 @@ def child(plan: dict | None, arguments: list[str], log: Path) -> None:
     if plan is not None and "full" in plan:
         fill_disk(plan["full"])
     if plan is not None and "largest" in plan:
+        import resource  # not on Windows, where its places are collected
+
         resource.setrlimit(resource.RLIMIT_FSIZE, (plan["largest"], plan["largest"]))
     entered: list[float] = []
     if plan is not None and "phase" in plan and "after" in plan:

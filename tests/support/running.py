@@ -71,11 +71,15 @@ def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
     return subprocess.Popen(
         command,
         # A shell's background jobs ignore Ctrl-C and so would their children; a person's terminal does not.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=_hear_ctrl_c if os.name == "posix" else None,
         env=os.environ | options.pop("env", {}),
         text=True,
         **({"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options),
     )
+
+
+def _hear_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def finished(process: subprocess.Popen | Forked) -> tuple[int | None, str]:

@@ -33,7 +33,7 @@ def test_it_has_its_own_folder_environment_arguments_and_session(tmp_path, monke
         ("import sys; sys.exit('no')", 1, "no\n"),
         ("1 / 0", 1, "ZeroDivisionError"),
         ("raise KeyboardInterrupt", -signal.SIGINT, "KeyboardInterrupt"),
-        ("import os; os.kill(os.getpid(), 9)", -signal.SIGKILL, ""),
+        ("import os; os.kill(os.getpid(), 9)", -9, ""),
         ("import atexit; atexit.register(print, 'at the end')", 0, "at the end\n"),
         ("import threading; threading.Timer(0.2, print, ['late']).start()", 0, "late\n"),
     ],

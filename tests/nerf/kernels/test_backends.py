@@ -11,6 +11,7 @@ from types import ModuleType
 import numba
 import pytest
 import torch
+from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam.step import adam_step
@@ -172,10 +173,12 @@ def returned(tmp_path, *numbers):
     return done.stdout.splitlines()
 
 
+@POSIX
 def test_a_change_of_a_number_in_another_file_is_compiled_in(tmp_path):
     assert returned(tmp_path, 11, 11, 22) == ["11 0", "11 1", "22 0"]  # the second one is kept
 
 
+@POSIX
 def test_a_flipped_bit_in_a_cached_kernel_changes_no_result(tmp_path):
     number = 1234567891234
     assert returned(tmp_path, number, number) == [f"{number} 0", f"{number} 1"]
