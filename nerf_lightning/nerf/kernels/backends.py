@@ -81,7 +81,10 @@ def is_kept(module: str) -> bool:
 
 def _is_kept(module: ModuleType) -> bool:
     caches = [getattr(kernel._cache, "_cache_file", None) for kernel in _compiled(module)]
-    return any(cache._load_index() for cache in caches if cache is not None)
+    try:
+        return any(cache._load_index() for cache in caches if cache is not None)
+    except Exception:  # a damaged index: unpickling raises anything
+        return False
 
 
 def keeps_kernels() -> bool:
