@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("LICENSE", "README.md", "SECURITY.md")
-COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.toml", *PAGES)
+COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.toml", "Makefile", *PAGES)
 DOCUMENTS = ("tests/test_documents.py", "tests/test_packaging.py")
 """They are of the whole project, and name commands and files of extensions."""
 

@@ -3,6 +3,9 @@
 import json
 import os
 import re
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import pytest
 from support.measured_runs import leave_measured_run
@@ -10,8 +13,13 @@ from support.running import FAST, refused, said
 from support.shiny_ball import all_around, record_of
 
 from nerf_lightning.commands.export import page_path
+from nerf_lightning.commands.train_job import show
+from nerf_lightning.commands.train_job.build import TrainJob
+from nerf_lightning.doctor.check import Check
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.page_file import MARK
+from nerf_lightning.report.page import Report
+from nerf_lightning.report.read_run import _add_exports
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
@@ -56,6 +64,46 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     assert (seen["degree"], seen["training"]) == (1, False)
     assert len(seen["beside"].photographs.view_names) == 10
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)
+
+
+FLAT, RISING = [20.0] * 40 + [25.0] * 60, [20.0 + 0.1 * row for row in range(100)]
+
+
+@pytest.mark.parametrize(
+    ("steps", "curve", "cure"),
+    [
+        (43, FLAT, "train longer (nerf train resume=run budget.seconds=300)."),
+        (4000, RISING, "train longer (nerf train resume=run budget.seconds=300)."),
+        (4000, FLAT, "Take 6 more photographs."),
+    ],
+)
+def test_longer_training_is_advised_before_more_photographs_while_it_helps(monkeypatch, steps, curve, cure):
+    monkeypatch.setattr(show, "read_curves", lambda folder: {"PSNR/train_fine": (range(100), curve)})
+    monkeypatch.setattr(show, "resume_command", lambda folder: f"nerf train resume={folder}")
+    job = create_autospec(
+        TrainJob,
+        instance=True,
+        scene=SimpleNamespace(view_names=["a"] * 16, left_out=["b"], truth=None),
+        config=SimpleNamespace(budget=SimpleNamespace(seconds=30)),
+        checks=[Check("coverage", "look", "a gap", "Take 6 more photographs.")],
+        system=SimpleNamespace(model=SimpleNamespace(level_names=("proposal", "fine"))),
+    )
+    line = show._result(job, Path("run/report.html"), 20.6, steps)
+    assert line.endswith(f": 20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it: {cure}")
+
+
+@pytest.mark.parametrize(
+    ("age", "link", "of"), [(-60, "", ", of an earlier checkpoint"), (60, "./export/page.html", "")]
+)
+def test_what_was_exported_before_the_last_checkpoint_is_not_taken_for_its(tmp_path, age, link, of):
+    for name, content in {"checkpoints/last.ckpt": b"", "export/page.html": MARK, "export/points.ply": b""}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    for file in (tmp_path / "export").iterdir():
+        os.utime(file, ns=(0, (tmp_path / "checkpoints/last.ckpt").stat().st_mtime_ns + age * 10**9))
+    report = Report("a run")
+    _add_exports(report, tmp_path / "export", tmp_path)
+    assert (report.scene_page, report.exports) == (link, [(f"points.ply (0 MB{of})", "./export/points.ply")])
 
 
 def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):

@@ -12,6 +12,8 @@ from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
+from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
+
 
 def events(folder):
     everything = dict.fromkeys(("tensors", "images", "scalars", "histograms"), 0)
@@ -143,6 +145,13 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_pa
     ours = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     theirs = torch.load(finished_run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
+
+
+@pytest.mark.parametrize(("has_transparency", "said"), [(True, "2 views, white background)"), (False, "2 views)")])
+def test_a_background_is_named_only_where_one_can_be_seen_through_images(finished_run, has_transparency, said):
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    metrics["protocol"]["background"], metrics["num_images"] = "white", 2
+    assert said in metric_lines(metrics, finished_run, has_transparency)[0]
 
 
 # Every experiment is composed and built elsewhere; these take the longest to end.
