@@ -24,6 +24,7 @@ FEW_MATCHES = 30
 STEP = 10.0  # Degrees between neighbors of a good ring of photographs.
 # Degrees between a held-out view and the nearest one that is learned from.
 FAR_HELD_OUT = 40.0
+SOUND = 0.5  # Share of matched details that lie where the cameras say, from which on the axes are right.
 
 
 def rigid(evidence: Given) -> Check:
@@ -61,6 +62,8 @@ def common_middle(evidence: Given) -> Check:
             "look outward from one position, the poses are right."
         )
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
+        if isinstance(evidence, Evidence) and evidence.agreement >= SOUND:
+            return look(f"{message}, and the photographs agree with the poses", "Nothing, if they look outward.")
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
     cure = "See doctor.png: the cameras should face what was photographed. If not, see the check of axes."
     return look(f"only {100 * ahead:.0f} % of the cameras face a common focus point", cure)

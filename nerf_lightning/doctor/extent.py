@@ -4,11 +4,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, wrong
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import rays_through_pixels, seen_at
 from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -19,6 +20,8 @@ FEWEST = 50
 FEW, MANY = 0.03, 0.15
 # Of each view, a grid of GRID x GRID pixels is looked at.
 GRID = 12
+# Of sparse points and of views, that are looked at.
+MOST_POINTS, MOST_VIEWS = 5000, 200
 UNITS = {"inches": 39.37, "feet": 3.281, "centimeters": 100.0, "millimeters": 1000.0}
 
 
@@ -47,13 +50,15 @@ def near_and_far(evidence: Evidence) -> Check:
         return ok(message)
     cut = f"{100 * before:.0f} % of it in front of near and {100 * beyond:.0f} % behind far"
     cure = f"Set scene.near={0.8 * low:.2g} scene.far={1.3 * high:.3g}.{_units(low, high, near, far)}"
-    return (wrong if max(before, beyond) > MANY else look)(f"{message}: {cut}", cure)
+    # What nobody has typed is a guess of this program, which is never wrong to the user.
+    serious = max(before, beyond) > MANY and (scene.space == "bounded" or scene.protocol.keys() & {"near", "far"})
+    return (wrong if serious else look)(f"{message}: {cut}", cure)
 
 
 def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "content"]] | None:
     """Return views, and how far from them content lies that they show (scene units; in NDC: depth before bending).
 
-    From matched details, and where these are few from the sparse points.
+    From matched details, and where these are few from the known distances, or from the sparse points.
     """
     scene, matches = evidence.scene, evidence.matches
     good = clear_matches(evidence)
@@ -61,13 +66,24 @@ def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "conten
         if scene.space == "ndc":
             return matches.view[good, 0], -places(matches, scene.cameras.c2w)[good, 2]
         return matches.view[good].flatten(), distances(matches, scene.cameras.c2w)[good].flatten()
-    if len(scene.points) < FEWEST:
-        return None
     if scene.space == "ndc":
-        return torch.zeros(len(scene.points), dtype=torch.long), -scene.points[:, 2]
-    eyes = scene.cameras.c2w[:, :, 3]
-    nearest = [torch.cdist(eyes, part).min(dim=0) for part in scene.points.split(rows_at_once(len(eyes)))]
-    return torch.cat([each.indices for each in nearest]), torch.cat([each.values for each in nearest])
+        few = len(scene.points) < FEWEST
+        return None if few else (torch.zeros(len(scene.points), dtype=torch.long), -scene.points[:, 2])
+    if scene.depths is not None and len(scene.depths) >= FEWEST:
+        return scene.depths.pixels.view, scene.depths.distance
+    return _in_pictures(scene)
+
+
+def _in_pictures(scene: Scene) -> tuple[Tensor, Float[Tensor, "content"]] | None:
+    """Return views, and how far from them sparse points lie that are in their pictures; None: few are."""
+    points = scene.points[:: 1 + len(scene.points) // MOST_POINTS]
+    views, found = [], []
+    for view in evenly_spaced_subset(range(len(scene.view_names)), MOST_VIEWS):
+        inside, _, _ = seen_at(scene.cameras, view, points)
+        found.append((points[inside] - scene.cameras.c2w[view, :, 3]).norm(dim=-1))
+        views.append(torch.full((len(found[-1]),), view))
+    distance = torch.cat(found)
+    return (torch.cat(views), distance) if len(distance) >= FEWEST else None
 
 
 def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:

@@ -18,6 +18,9 @@ from nerf_lightning.doctor.features import fineness_of
 from nerf_lightning.doctor.matches import nearest_views
 from nerf_lightning.messages.errors import InputError
 
+TYPED = {"near": "8", "far": "12"}
+"""What the protocol of a scene has where a person has said it."""
+
 
 def judged(evidence, name, verdict, *fragments):
     check = but_poses(evidence)[name]
@@ -119,15 +122,16 @@ def test_views_are_compared_a_few_at_a_time(monkeypatch):
 
 
 def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_are_named():
-    evidence = with_scene(near=torch.full((VIEWS,), 8.0))
-    check = judged(evidence, "near and far", "wrong", "in front of near", "Set scene.near=")
+    near = torch.full((VIEWS,), 8.0)
+    judged(with_scene(near=near), "near and far", "look", "in front of near", "Set scene.near=")  # this program's guess
+    check = judged(with_scene(near=near, protocol=TYPED), "near and far", "wrong", "in front of near")
     near = float(check.cure.split("near=")[1].split()[0])
     judged(with_scene(near=torch.full((VIEWS,), near)), "near and far", "ok")
     scene = corner_scene()
     found = but_poses(corner_evidence())["near and far"].message
     low, high = (float(found.split("lies ")[1].split()[place]) for place in (0, 2))
     near, far = torch.full((VIEWS,), 39.37 * low), torch.full((VIEWS,), 39.37 * high)
-    judged(with_scene(near=near, far=far), "near and far", "wrong", "inches", "too large")
+    judged(with_scene(near=near, far=far, protocol=TYPED), "near and far", "wrong", "inches", "too large")
     assert scene.near[0] < low
 
 
@@ -135,14 +139,14 @@ def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_a
 def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
     at_cameras = (torch.arange(VIEWS), torch.zeros(VIEWS))
     monkeypatch.setattr(extent, "content_distances", lambda evidence: at_cameras)
-    evidence = with_scene(near=torch.full((VIEWS,), near), far=torch.full((VIEWS,), near - 0.1))
+    evidence = with_scene(near=torch.full((VIEWS,), near), far=torch.full((VIEWS,), near - 0.1), protocol=TYPED)
     assert extent.near_and_far(evidence).verdict == "wrong"
 
 
 @pytest.mark.parametrize(
     ("changes", "name", "verdict", "fragments"),
     [
-        ({"far": torch.full((VIEWS,), 0.9)}, "near and far", "wrong", ("behind far",)),
+        ({"far": torch.full((VIEWS,), 0.9), "protocol": TYPED}, "near and far", "wrong", ("behind far",)),
         ({"left_out": ("a.jpg", "b.jpg")}, "photographs without pose", "look", ("2 of 14", "a.jpg, b.jpg")),
         ({"left_out": tuple("abcdefghijklmnop")}, "photographs without pose", "look", ("16 of 28",)),
         ({"splits": {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}}, "split", "wrong", ("view 2.png",)),

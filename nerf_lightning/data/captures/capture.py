@@ -14,6 +14,11 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import LensModel
 
+SINGLE: tuple[LensModel, ...] = ("fisheye", "equirectangular")
+"""Lenses that no other kind holds."""
+MOST_ODD = 0.25
+"""Of the views may have another kind of lens than the others, and are left out."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -104,7 +109,7 @@ def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
     """
     if len(kinds) == 1:
         return next(iter(kinds))
-    if kinds & {"fisheye", "equirectangular"}:
+    if kinds & set(SINGLE):
         return None
     return "radial_tangential" if "radial_tangential" in kinds else "pinhole"
 
@@ -122,3 +127,25 @@ def one_lens_model(kinds: set[LensModel], source: Path) -> LensModel:
             "photographs, or split the capture: one for each kind."
         )
     return lens_model
+
+
+def of_one_lens(capture: Capture, kinds: Sequence[LensModel]) -> Capture:
+    """Return a capture with the lens model that holds those of all views (`kinds`), or of all but a few.
+
+    A scene has one kind of lens. Up to a quarter of the views, which have another one, are left out.
+
+    Raises:
+        InputError: no kind is that of most views.
+    """
+    groups = [{kind for kind in kinds if kind not in SINGLE}, *({kind} for kind in SINGLE)]
+    usual = max(groups, key=lambda group: sum(kind in group for kind in kinds))
+    kept = [number for number, kind in enumerate(kinds) if kind in usual]
+    if len(kinds) - len(kept) > MOST_ODD * len(kinds):
+        one_lens_model(set(kinds), capture.source)
+    for view, kind in zip(capture.views, kinds, strict=True):
+        if kind not in usual:
+            capture.left_out.faults[view.name] = (
+                f"{capture.source}: {view.name} has another kind of lens ({kind}) than most views, and a scene has "
+                "one. Undistort the photographs."
+            )
+    return replace(capture.some(kept), lens_model=one_lens_model(usual, capture.source))

@@ -16,6 +16,7 @@ from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal, listed, require_printable
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
+from nerf_lightning.nerf.geometry.lens_checks import lens_faults
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, SceneRecord
 
@@ -78,7 +79,33 @@ def usable(capture: Capture) -> Capture:
         split: tuple(dict.fromkeys(same.get(number, number) for number in numbers))
         for split, numbers in capture.splits.items()
     }
-    return _with_known_depths(replace(capture, views=views, splits=splits).some(kept))
+    return _with_known_depths(_with_sound_lenses(replace(capture, views=views, splits=splits).some(kept)))
+
+
+def _with_sound_lenses(capture: Capture) -> Capture:
+    """Return the capture without the views whose lens cannot be inverted (`geometry.lens_checks`)."""
+    views = capture.views
+    if not views:
+        return capture
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([getattr(view, name) for view in views], dtype=torch.float64)
+
+    size = column("size").round().long()
+    cameras = Cameras(
+        c2w=torch.stack([view.c2w for view in views]),
+        focal=column("focal"),
+        center=column("center"),
+        lens=column("lens"),
+        lens_model=capture.lens_model,
+        width=size[:, 0],
+        height=size[:, 1],
+    )
+    faults = lens_faults(cameras, [view.name for view in views])
+    capture.left_out.faults |= {views[number].name: fault for number, fault in faults.items()}
+    kept = [number for number in range(len(views)) if number not in faults]
+    capture.left_out.require_enough(len(kept))
+    return capture.some(kept)
 
 
 def _almost_alike(one: Float[Tensor, "3 4"], other: Float[Tensor, "3 4"], reach: float) -> bool:

@@ -40,6 +40,8 @@ MOST_POINTS = 20_000
 NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
 # Room around the sparse points on each side of their box, as a share of it.
 BOX_MARGIN = 0.1
+# Times the median camera's distance from the middle: one that is farther away is a mistake of the reconstruction.
+FARTHEST_CAMERA = 3.0
 # Without sparse points, in units of the farthest camera's distance from the middle.
 NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
 # Cameras that stand closer together than this share of their coordinates, which may be a map's, stand at one place.
@@ -59,9 +61,13 @@ IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
 
 
 def choose_space(
-    asked: Space | Literal["auto"], cameras: Cameras, capture: Capture, has_transparency: bool
+    asked: Space | Literal["auto"],
+    cameras: Cameras,
+    capture: Capture,
+    has_transparency: bool,
+    near: float | None = None,
 ) -> tuple[Space, str]:
-    """Return the space, and why; NDC is refused where it cannot work."""
+    """Return the space, and why; NDC is refused where it cannot work. `near` is as for `extent_of`."""
     cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
     if asked == "ndc" and not ahead:
         raise InputError(
@@ -72,10 +78,13 @@ def choose_space(
         return asked, "as asked"
     if has_transparency:
         return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
-    if ahead and cosine > FORWARD_FACING and capture.bounds is not None:
-        return "ndc", "since all cameras look the same way and the capture gives depths"
-    if ahead and cosine > FORWARD_FACING and len(capture.points):
-        return "ndc", "since all cameras look the same way and sparse points give depths"
+    if ahead and cosine > FORWARD_FACING and (capture.bounds is not None or len(capture.points)):
+        try:
+            _near_plane(capture, cameras, near)
+        except InputError:
+            return "contracted", "since the cameras look the same way, but some stand behind what others show"
+        depths = "the capture gives" if capture.bounds is not None else "sparse points give"
+        return "ndc", f"since all cameras look the same way and {depths} depths"
     return "contracted", "since the photographs show a background"
 
 
@@ -112,8 +121,9 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     if space == "ndc":
         return _forward_facing(capture, cameras, near, far)
     focus = middle_of_cameras(cameras)
-    # The farthest camera stands at distance 1.
-    unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max())
+    # The farthest camera stands at distance 1, but for those that have drifted away.
+    distance = (cameras.c2w[:, :, 3] - focus).norm(dim=-1)
+    unit = float(torch.minimum(distance.max(), FARTHEST_CAMERA * distance.median()))
     to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)
     nearest, farthest = _from_points(capture, cameras, to_user)
     aabb = _cube(UNIT_BALL_HALF)
@@ -237,16 +247,7 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far:
             f"scene.far={far:g} cannot be used with scene.space=ndc, which reaches to infinity. Leave it out, or use "
             "scene.space=contracted or bounded."
         )
-    mean = average_pose(cameras.c2w)
-    plane = near if near is not None else NEAR_SHARE * _nearest_depth(capture, cameras)
-    ahead = -(cameras.c2w[:, :, 3] - mean[:, 3]) @ mean[:, 2]
-    if float(ahead.max()) >= plane:
-        view = capture.views[int(ahead.argmax())].name
-        raise InputError(
-            f"scene.space=ndc: the view {view} of {capture.source} stands {float(ahead.max()):.4g} ahead of the "
-            f"cameras' middle, behind the near plane at {plane:.4g}, so what is in front of it would be lost. Use "
-            "scene.space=contracted, or give a larger scene.near."
-        )
+    mean, plane = average_pose(cameras.c2w), _near_plane(capture, cameras, near)
     to_user = similarity(mean[:, :3], mean[:, 3], plane)
     half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
     scale = (cameras.focal / half_size).median(dim=0).values.float()
@@ -258,6 +259,21 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far:
     aabb[:, 2] = torch.tensor([-1.0, 1.0])
     views = len(capture.views)
     return Extent(to_user, torch.zeros(views), length.expand(views).clone(), aabb, ndc)
+
+
+def _near_plane(capture: Capture, cameras: Cameras, near: float | None) -> float:
+    """Return how far before the cameras' middle the near plane of NDC lies; refuse one that a camera stands behind."""
+    mean = average_pose(cameras.c2w)
+    plane = near if near is not None else NEAR_SHARE * _nearest_depth(capture, cameras)
+    ahead = -(cameras.c2w[:, :, 3] - mean[:, 3]) @ mean[:, 2]
+    if float(ahead.max()) >= plane:
+        view = capture.views[int(ahead.argmax())].name
+        raise InputError(
+            f"scene.space=ndc: the view {view} of {capture.source} stands {float(ahead.max()):.4g} ahead of the "
+            f"cameras' middle, behind the near plane at {plane:.4g}, so what is in front of it would be lost. Use "
+            "scene.space=contracted, or give a larger scene.near."
+        )
+    return plane
 
 
 def _nearest_depth(capture: Capture, cameras: Cameras) -> float:

@@ -132,6 +132,8 @@ class CaptureReader(Reader):
             "hold_every": str(self.hold_every),
             "frames": self.frames or "all",
         }
+        given = {"near": self.near, "far": self.far}
+        protocol |= {name: f"{value:g}" for name, value in given.items() if value is not None}
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
         return scene_of(
             capture,

@@ -10,7 +10,6 @@ from nerf_lightning.data.captures.extent import choose_space, extent_of, require
 from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
@@ -56,11 +55,10 @@ def scene_of(
         metres_per_unit: how many meters a unit of the user's frame is long; None: unknown.
 
     Raises:
-        InputError: a lens that folds back, or cameras and content that leave no room for a scene.
+        InputError: cameras and content that leave no room for a scene.
     """
     names = tuple(view.name for view in capture.views)
-    require_invertible(cameras, names)
-    chosen, reason = choose_space(space, cameras, capture, pixels.has_transparency)
+    chosen, reason = choose_space(space, cameras, capture, pixels.has_transparency, near)
     log.info("%s: space=%s, %s", name, chosen, reason)
     extent = extent_of(capture, cameras, chosen, near, far)
     to_user = capture.undo @ extent.to_user

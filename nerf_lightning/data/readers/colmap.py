@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import (
     PICTURE_FOLDERS,
@@ -125,20 +125,20 @@ class ColmapReader(CaptureReader):
                 views.append(_view(image, camera, files[image.name]))
                 kept.append(image)
         left_out.require_enough(len(views))
-        lenses = {LAYOUTS[model.cameras[image.camera].model][0] for image in kept}
+        lenses = [LAYOUTS[model.cameras[image.camera].model][0] for image in kept]
         taken = set(files.values())
         base = os.path.commonpath([path.parent for path in taken])
         others = [path for path in pictures_below(Path(base)) if path not in taken]
         left_out.without_pose = tuple(path.relative_to(base).as_posix() for path in others) if self._own(base) else ()
-        return Capture(
+        capture = Capture(
             views=tuple(views),
             source=folder,
-            lens_model=one_lens_model(lenses, folder),
             points=torch.from_numpy(model.points.positions),
             point_errors=torch.from_numpy(model.points.errors),
             tracks=torch.from_numpy(_tracks(kept, model.points)),
             left_out=left_out,
         )
+        return of_one_lens(capture, lenses)
 
     def _own(self, folder: str) -> bool:
         """Tell whether a folder is one of photographs, and not one that holds all kinds of pictures."""

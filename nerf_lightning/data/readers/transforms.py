@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -72,10 +72,9 @@ class TransformsReader(CaptureReader):
         undo = _undo_of(files)
         views = self._with_masks_and_depths(paths[0], found, 1.0 / unit_of(undo))
         left_out.without_pose = self._without_pose(views, left_out)
-        return Capture(
+        capture = Capture(
             views=tuple(views),
             source=paths[0],
-            lens_model=one_lens_model({frame.lens_model for frame in found}, paths[0]),
             points=_points(files, self.top(), self.allow_outside),
             splits=_splits(files[0], found)
             if len(files) == 1
@@ -84,6 +83,7 @@ class TransformsReader(CaptureReader):
             box=next((box for file in files if (box := _ngp_box(file.content, str(file.path))) is not None), None),
             left_out=left_out,
         )
+        return of_one_lens(capture, [frame.lens_model for frame in found])
 
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()

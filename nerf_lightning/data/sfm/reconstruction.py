@@ -39,6 +39,7 @@ class NothingFoundError(InputError):
         self.cause = cause
 
 
+OF_ONE_PHOTOGRAPH = "SIMPLE_RADIAL"
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
 FEWEST_REGISTERED = 3
 FEWEST_POINTS = 30
@@ -189,7 +190,9 @@ def _find_features(
     report(FEATURES, 0.0)
     for names, mode in [*((group, colmap.CameraMode.SINGLE) for group in shared), (alone, colmap.CameraMode.PER_IMAGE)]:
         reader = colmap.ImageReaderOptions()
-        reader.camera_model = lens
+        # One photograph does not settle more than one term of a lens.
+        is_free = mode == colmap.CameraMode.PER_IMAGE and lens == SfmSettings.camera_model
+        reader.camera_model = OF_ONE_PHOTOGRAPH if is_free else lens
         for start in range(0, len(names), settings.threads):
             part = names[start : start + settings.threads]
             colmap.extract_features(

@@ -1,4 +1,4 @@
-"""Which lenses can be inverted over their whole image; the others are refused before anything is learned."""
+"""Which lenses can be inverted over their whole image; views with others are left out before anything is learned."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import image_plane
 from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
 from nerf_lightning.nerf.types.scene import Cameras
@@ -17,8 +16,8 @@ STEPS_FROM_AXIS = 8
 """Places looked at between the axis and each place of the grid."""
 
 
-def require_invertible(cameras: Cameras, names: Sequence[str]) -> None:
-    """Refuse lenses that show one direction at two places of the image, or that cannot be inverted there.
+def lens_faults(cameras: Cameras, names: Sequence[str]) -> dict[int, str]:
+    """Return the views whose lens shows one direction at two places of the image, or cannot be inverted there, and why.
 
     Looked at is a grid of 33 x 33 places from border to border of each image. Each must come back from its direction
     to `TOLERANCE` pixels, and on the way to it from the axis the lens must not fold back: beyond a fold the inverse
@@ -26,22 +25,21 @@ def require_invertible(cameras: Cameras, names: Sequence[str]) -> None:
 
     Args:
         cameras: all views; a pinhole is always fine.
-        names: of the views, or of their cameras, for the message.
-
-    Raises:
-        InputError: the first lens that is refused, with all views that share it.
+        names: of the views, or of their cameras, for the messages.
     """
     if cameras.lens_model == "pinhole":
-        return
+        return {}
     exact = cameras.to("cpu").map(lambda x: x.double() if x.is_floating_point() else x)
     rows = torch.cat([exact.lens, exact.focal, exact.center, exact.width[:, None], exact.height[:, None]], dim=-1)
     views_of: dict[tuple[float, ...], list[int]] = {}
     for view, row in enumerate(rows.tolist()):
         views_of.setdefault(tuple(row), []).append(view)
+    faults: dict[int, str] = {}
     for views in views_of.values():
-        fault = _fault(exact, views[0])
-        if fault:
-            raise InputError(_message(cameras, views[0], [names[view] for view in views], fault))
+        if (fault := _fault(exact, views[0])) is not None:
+            message = _message(cameras, views[0], [names[view] for view in views], fault)
+            faults |= dict.fromkeys(views, message)
+    return faults
 
 
 def _fault(cameras: Cameras, view: int) -> str | None:

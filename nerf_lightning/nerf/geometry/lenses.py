@@ -56,7 +56,7 @@ def unproject(
 ) -> Float[Tensor, "*rays 3"]:
     """Return the directions (not of unit length) that the lens shows at places of the image.
 
-    The inverse of `project_plane` wherever `geometry.lens_checks.require_invertible` has nothing to refuse.
+    The inverse of `project_plane` wherever `geometry.lens_checks.lens_faults` finds nothing.
     """
     if model == "equirectangular":
         return unproject_panorama(plane)

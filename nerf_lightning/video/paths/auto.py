@@ -1,15 +1,17 @@
-"""The path that suits a capture: along its photographs where these look at one thing, else in front of it."""
+"""The path that suits a capture: around what its photographs look at, in front of it, or past the photographs."""
 
 from dataclasses import dataclass
 from typing import final
 
 from torch.nn.functional import normalize
 
+from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, average_pose, least_agreement
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.paths.sweep import Sweep
+from nerf_lightning.video.paths.walk import Walk
 
 FACING = 0.7  # Least cosine between where most photographs look and the center.
 
@@ -17,7 +19,7 @@ FACING = 0.7  # Least cosine between where most photographs look and the center.
 @final
 @dataclass
 class AutoPath(CameraPath):
-    """A sweep along the photographs, or a spiral in front of what faces them.
+    """A sweep around what the photographs look at, a spiral in front of what faces them, or a walk past them.
 
     Args:
         longest: without width and height, the maximum length of the longer side, in pixels; otherwise images are as
@@ -37,7 +39,7 @@ class AutoPath(CameraPath):
         width = self.width
         if width is None and self.height is None:
             width = max(1, round(around.width * min(1.0, self.longest / max(around.width, around.height))))
-        path = Sweep if looks_at_center(around) else Spiral
+        path = Sweep if looks_at_center(around) else Spiral if faces_one_way(around) else Walk
         return path(self.num_frames, width=width, height=self.height, fov=self.fov).cameras(around)
 
 
@@ -48,3 +50,13 @@ def looks_at_center(around: PathFrame) -> bool:
         return False
     offsets = normalize(around.poses[:, :, 3] - around.center, dim=-1)
     return float((offsets * around.poses[:, :, 2]).sum(dim=-1).median()) > FACING
+
+
+@disable_autocast
+def faces_one_way(around: PathFrame) -> bool:
+    """Return whether the photographs were taken side by side, looking the same way, and not one ahead of the other."""
+    if around.forward_facing:
+        return True
+    mean = average_pose(around.poses)
+    spread = ((around.poses[:, :, 3] - mean[:, 3]) @ mean[:, :3]).std(dim=0, correction=0)
+    return least_agreement(around.poses) > FORWARD_FACING and float(spread[2]) < float(spread[:2].max())

@@ -10,7 +10,9 @@ from PIL import Image
 from support.posed_captures import Known, read, ring, user_rays, wall, write_colmap, write_llff, write_transforms
 
 from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.poses import look_at
 
 AHEAD = np.array([0.0, 5.0, 0.0])
 PLACES = [(0.0, 0.0), (0.99, 0.0), (0.5, 0.5), (0.2, 0.9)]
@@ -88,6 +90,37 @@ def test_auto_does_not_bend_rays_that_look_sideways(tmp_path):
     # A lens of 160 degrees on forward-facing cameras: its corners do not look ahead.
     scene = read("llff", write_llff(tmp_path / "c", Known(c2w=wall(), focal=(0.8, 0.8))))
     assert scene.space == "contracted"
+
+
+def corridor(count=9):
+    """Cameras that walk straight ahead, past what the first of them show."""
+    eyes = torch.stack(
+        [torch.zeros(count), torch.arange(count) * 1.0, 0.02 * torch.arange(count) % 0.1], dim=-1
+    ).double()
+    ahead = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    return look_at(eyes, eyes + ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).numpy()
+
+
+def test_auto_takes_no_space_that_would_be_refused(tmp_path, caplog):
+    points = np.random.default_rng(1).uniform([-1, 1, -1], [1, 12, 1], (300, 3))
+    root = write_colmap(tmp_path / "c", Known(c2w=corridor(), points=points))
+    with caplog.at_level(logging.INFO):
+        assert read("colmap", root).space == "contracted"
+    assert "some stand behind what others show" in caplog.text
+    with pytest.raises(InputError, match=r"stands .* ahead of the cameras' middle"):
+        read("colmap", root, space="ndc")
+
+
+@pytest.mark.parametrize("away", [5.0, 20.0, 200.0])
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_cameras_that_drifted_away_do_not_shrink_the_scene(tmp_path, away, write):
+    poses = ring(20)
+    poses[[3, 11], :, 3] *= away
+    scene = read(write.__name__.removeprefix("write_"), write(tmp_path / "c", Known(c2w=poses)))
+    distance = scene.cameras.c2w[:, :, 3].norm(dim=-1)
+    assert 0.3 < float(distance.median()) < 1.0
+    usual = read(write.__name__.removeprefix("write_"), write(tmp_path / "usual", Known(c2w=ring(20))))
+    assert float(usual.cameras.c2w[:, :, 3].norm(dim=-1).max()) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_pictures_with_alpha_are_bounded(tmp_path):

@@ -103,8 +103,11 @@ TRANSFORMS = {
     "half a panorama": (top(camera_model="VR180_L"), r"camera_model 'VR180_L'; supported are PINHOLE, .* export"),
     "a panorama of more than a turn": (top(**PANORAMA, fl_x=5.0, fl_y=12.0), r"with fl_x=5 and fl_y=12 for 16 x 12"),
     "a bent pinhole": (top(camera_model="PINHOLE", k1=0.1), r"has the camera_model PINHOLE and distortion"),
-    "a panorama among others": (frame(1, **PANORAMA, fl_x=8.0, fl_y=12.0), r"mixes lenses of several kinds \(equirect"),
-    "a fisheye among others": (frame(1, camera_model="OPENCV_FISHEYE", k1=0.1), r"mixes lenses of .*fisheye, pinhole"),
+    "a panorama among others": (frame(1, **PANORAMA, fl_x=8.0, fl_y=12.0), r"has another kind of lens \(equirect"),
+    "a fisheye among others": (
+        frame(1, camera_model="OPENCV_FISHEYE", k1=0.1),
+        r"another kind of lens \(fisheye",
+    ),
     "a tangential fisheye": (top(camera_model="OPENCV_FISHEYE", p1=0.1), r"The lens of images/p_0.png .*tangential"),
     "a mask by number": (frame(1, mask_path=3), r"of 1 files \(mask_path\) 1 are missing or are not pictures: 3"),
     "an absent mask": (frame(1, mask_path="a.png"), r"1 files \(mask_path\) 1 are missing or are not pictures: a.png"),
@@ -216,7 +219,7 @@ COLMAP = {
     "half a model": (lambda root: (root / IMAGES).unlink(), r"images.bin does not exist; the folder holds cameras"),
     "an unknown number": (cameras(77, *PINHOLE), r"cameras.bin holds a camera of the unknown model number 77"),
     "an unknown lens": (cameras(7, *PINHOLE, 0.1), r"uses the camera model FOV, whose .* not supported"),
-    "two kinds of lenses": (mixed, r"mixes lenses of .* \(fisheye, pinhole\), and a scene"),
+    "two kinds of lenses": (mixed, r"p_0.png has another kind of lens \(fisheye\) than most"),
     "an empty model": (emptied, r"has no registered photograph, so nothing can be learned. Copy the model again, or"),
     "a tail": (text(IMAGES, lambda old: old + b"tail"), r"images.bin cannot be read .* claims \S+ bytes, but has"),
     "files exchanged": (exchanged, r"(cameras|images).bin (cannot be read|holds)"),
@@ -306,11 +309,12 @@ ONE_VIEW = {
         *("digits in a pose", "a path of Windows", "an absolute path", "an absent image", "a long name"),
         *("an image by number", "a pose without its last row", "a pose of words", "a ragged pose"),
         *("a pose of one number", "a pose with NaN", "a camera far away", "a mask of another size"),
+        *("a panorama among others", "a fisheye among others"),
     },
     "llff": {"NaN in a pose"},
     "colmap": {
         *("a photograph without a name", "no rotation", "a photograph missing", "an absolute name", "a long name"),
-        "a name that is no text",
+        *("a name that is no text", "two kinds of lenses"),
     },
     "text": set[str](),
     "photographs": set(PHOTOGRAPHS),
@@ -384,7 +388,12 @@ SETTINGS = [
     ("llff", None, {"space": "ndc"}, r"ndc needs cameras that all look the same way, .*scene.space=contracted"),
     ("transforms", JSON_WALL, {"space": "ndc"}, r"scene.space=ndc needs the depth at which content begins,"),
     ("llff", LLFF_WALL, {"far": 9.0}, r"scene.far=9 cannot be used with scene.space=ndc, which reaches to infinity"),
-    ("llff", ahead, {}, r"the view p_4.png .* stands 2.\d+ ahead of the cameras' middle, behind the near plane"),
+    (
+        "llff",
+        ahead,
+        {"space": "ndc"},
+        r"the view p_4.png .* stands 2.\d+ ahead of the cameras' middle, behind the near plane",
+    ),
 ]
 
 

@@ -6,9 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels
-from nerf_lightning.nerf.geometry.lens_checks import require_invertible
+from nerf_lightning.nerf.geometry.lens_checks import lens_faults
 from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
 from nerf_lightning.nerf.geometry.poses import look_at
 
@@ -223,19 +222,19 @@ def cameras_with(*lenses, model="radial_tangential", focal=60.0):
 
 def refused(cameras, *parts):
     names = ("a.jpg", "b.jpg", "c.jpg", "d.jpg")
-    with pytest.raises(InputError) as error:
-        require_invertible(cameras, names[: len(cameras.lens)])
-    message = str(error.value)
+    message = next(iter(lens_faults(cameras, names[: len(cameras.lens)]).values()))
     for part in parts:
         assert part in message, message
     assert "\n" not in message
 
 
 def test_lenses_that_are_used_pass():
-    require_invertible(cameras_with([0.0578421, -0.0805099, 0.0, 0.0, -0.00098, 0.00016], NONE), ["a", "b"])
-    require_invertible(cameras_with([-0.3, 0.1, 0.0, 0.0, 0.0, 0.0]), ["a"])
-    require_invertible(cameras_with([0.0348, 0.0040, -0.0029, 0.0006, 0.0, 0.0], model="fisheye", focal=40.0), ["a"])
-    require_invertible(cameras_with(NONE, model="pinhole"), ["a"])
+    assert not lens_faults(cameras_with([0.0578421, -0.0805099, 0.0, 0.0, -0.00098, 0.00016], NONE), ["a", "b"])
+    assert not lens_faults(cameras_with([-0.3, 0.1, 0.0, 0.0, 0.0, 0.0]), ["a"])
+    assert not lens_faults(
+        cameras_with([0.0348, 0.0040, -0.0029, 0.0006, 0.0, 0.0], model="fisheye", focal=40.0), ["a"]
+    )
+    assert not lens_faults(cameras_with(NONE, model="pinhole"), ["a"])
 
 
 def test_a_lens_that_folds_back_is_refused_by_the_name_of_its_views():
@@ -253,7 +252,7 @@ def test_the_place_where_it_folds_is_named():
     """Where r = 1 / sqrt(-3 k1), r (1 + k1 r^2) is highest, and 2/3 of that: nothing further out has a ray."""
     k1 = -0.6
     last = 2 / 3 / math.sqrt(-3 * k1)
-    require_invertible(cameras_with([k1, 0, 0, 0, 0, 0], focal=math.hypot(50, 40) / (0.98 * last)), ["a"])
+    assert not lens_faults(cameras_with([k1, 0, 0, 0, 0, 0], focal=math.hypot(50, 40) / (0.98 * last)), ["a"])
     refused(cameras_with([k1, 0, 0, 0, 0, 0], focal=math.hypot(50, 40) / (1.05 * last)), "a.jpg", "pixel (")
 
 
@@ -266,7 +265,7 @@ def test_an_exact_inverse_beyond_a_fold_is_refused():
 
 def test_a_fisheye_that_would_see_more_than_everything():
     """The corners are 64 pixels from the axis: 3.05 radians at a focal length of 21 pixels, but 3.37 at 19."""
-    require_invertible(cameras_with(NONE, model="fisheye", focal=21.0), ["a"])
+    assert not lens_faults(cameras_with(NONE, model="fisheye", focal=21.0), ["a"])
     refused(cameras_with(NONE, model="fisheye", focal=19.0), "a.jpg", "pixel (", "model fisheye")
 
 
