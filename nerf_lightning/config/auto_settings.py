@@ -85,7 +85,7 @@ def resolve_auto(
         InputError: a setting that is neither a value nor auto.
     """
     config = copy.deepcopy(config)
-    of_photos = choices.get("scene") == "photos"
+    is_capture = scene.truth is None and scene.capture_of is None
     seconds = config.budget.seconds
     if seconds == AUTO:
         has_steps = config.trainer.max_steps is not None or config.trainer.max_epochs is not None
@@ -93,8 +93,8 @@ def resolve_auto(
         if former is not None and not has_steps:
             seconds = _number(former, "budget.seconds")
     config, choices = fit_model("train", config, choices, overrides, scene, device_type == "cuda", seconds, former)
-    _settle(config, "doctor", of_photos)
-    _settle(config.final, "report", of_photos)
+    _settle(config, "doctor", is_capture)
+    _settle(config.final, "report", is_capture)
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
     if config.budget.seconds is None and config.trainer.max_steps is None and config.trainer.max_epochs is None:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
@@ -45,6 +46,25 @@ def transposed(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
     return torch.cat([c2w[:, :, :3].mT, c2w[:, :, 3:]], dim=-1)
 
 
+def centers_for_translations(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses with the translation (world to camera, right, down, forward) in the place of the center."""
+    return torch.cat([c2w[:, :, :3], -axes(c2w, FLIP_YZ)[:, :, :3].mT @ c2w[:, :, 3:]], dim=-1)
+
+
+def other_quaternions(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses whose quaternions (world to camera) are x, y, z, w where w, x, y, z was read."""
+    turned = axes(c2w, FLIP_YZ)
+    w2c = rotation_from_quaternion(quaternion_from_rotation(turned[:, :, :3].mT)[:, [3, 0, 1, 2]])
+    translation = -turned[:, :, :3].mT @ turned[:, :, 3:]
+    return axes(torch.cat([w2c.mT, -w2c.mT @ translation], dim=-1), FLIP_YZ)
+
+
+def mirrored(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses of a world, and cameras, whose z axes point the other way."""
+    signs = c2w.new_tensor([1.0, 1.0, -1.0])
+    return axes(c2w * signs[:, None], (1.0, 1.0, -1.0))
+
+
 def numeric_order(cameras: Cameras, names: tuple[str, ...]) -> Tensor:
     """Return where each view's row stands when rows follow the numbers in the names, not the names as text."""
     digits = ["".join(c for c in name.rsplit("/", 1)[-1] if c.isdigit()) for name in names]
@@ -70,13 +90,18 @@ def _pictures(x: float, y: float) -> Callable[[Scene, Matches], tuple[Tensor, Ma
 AXES = (
     Reading(
         "like OpenCV's or COLMAP's (right, down, forward) rather than OpenGL's (right, up, back)",
-        "Negate the second and third column of every rotation.",
+        "Set scene.axes=opencv, or negate the second and third column of every rotation.",
         _poses(lambda c2w: axes(c2w, FLIP_YZ)),
     ),
-    Reading("like world-to-camera rather than camera-to-world", "Invert every pose matrix.", _poses(inverted)),
+    Reading(
+        "like world-to-camera rather than camera-to-world",
+        "Set scene.poses=w2c, or invert every pose matrix.",
+        _poses(inverted),
+    ),
     Reading(
         "like world-to-camera with OpenCV's axes (as COLMAP writes them)",
-        "Invert every pose matrix, then negate the second and third column of its rotation.",
+        "Set scene.poses=w2c scene.axes=opencv, or invert every pose matrix, then negate the second and third column of"
+        " its rotation.",
         _poses(lambda c2w: axes(inverted(c2w), FLIP_YZ)),
     ),
     Reading(
@@ -101,6 +126,21 @@ AXES = (
         "as if the cameras' x and z axes were negated",
         "Negate columns 1 and 3 of every rotation.",
         _poses(lambda c2w: axes(c2w, (-1.0, 1.0, -1.0))),
+    ),
+    Reading(
+        "as if their quaternions were x, y, z, w, and not w, x, y, z",
+        "Write the quaternions as w, x, y, z.",
+        _poses(other_quaternions),
+    ),
+    Reading(
+        "as if the cameras' centers stood in the place of translations",
+        "Write the translation -R c in the place of each center c (R is the rotation, world to camera).",
+        _poses(centers_for_translations),
+    ),
+    Reading(
+        "like those of a left-handed world (Unity's)",
+        "Negate the third row and the third column of every pose matrix.",
+        _poses(mirrored),
     ),
 )
 """Of the poses."""

@@ -19,6 +19,8 @@ QUICK: dict[str, Callable[[Given], Check]] = {
     "number of views": cameras.number_of_views,
 }
 """Checks that cost nothing, and find what is wrong."""
+NEVER_POINTLESS = ("number of views", "split")
+"""Checks that do not stop a training, whatever they find: it is worth something all the same."""
 ROWS = 8  # Of a photograph, that are looked at first: nearly all show something there
 SPREAD = 3  # Levels of 255 that a JPEG makes of one
 
@@ -29,9 +31,9 @@ def require_sound(scene: Scene) -> list[Check]:
     """Examine a scene, and return what each check says; takes seconds."""
     _, checks = examine(scene)
     for check in checks:
-        if check.verdict == "look":
+        if check.verdict == "look" or (check.verdict == "wrong" and check.name in NEVER_POINTLESS):
             log.warning("doctor: %s: %s. %s", check.name, check.message, check.cure)
-    wrong = [check for check in checks if check.verdict == "wrong"]
+    wrong = [check for check in checks if check.verdict == "wrong" and check.name not in NEVER_POINTLESS]
     if wrong:
         first, others = wrong[0], ", ".join(check.name for check in wrong[1:])
         raise InputError(

@@ -199,11 +199,13 @@ def test_settings_of_the_user_hold_in_the_model_that_is_chosen():
     assert config.encoder.log2_table_size == 12
 
 
-def test_photographs_alone_are_examined_trained_for_minutes_and_reported():
+def test_captures_are_examined_trained_for_minutes_and_reported():
     photos, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "scene.root=a")
     assert (photos.doctor, photos.final.report, photos.budget.seconds) == (True, True, 300)
     other, _ = chosen_for(PHOTOGRAPHS, "scene=colmap", "scene.root=a")
-    assert (other.doctor, other.final.report, other.budget.seconds) == (False, False, 300)
+    assert (other.doctor, other.final.report, other.budget.seconds) == (True, True, 300)
+    built_in, _ = chosen_for(replace(PHOTOGRAPHS, truth=lambda view: None), "scene=bricks")
+    assert (built_in.doctor, built_in.final.report) == (False, False)
     given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false")
     assert (given.doctor, given.final.report) == (False, False)
 

@@ -6,11 +6,12 @@ from support.corner import corner_poses
 from support.doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
 
 from nerf_lightning.doctor import poses
-from nerf_lightning.doctor.conventions import axes, inverted, transposed
+from nerf_lightning.doctor.conventions import axes, inverted, mirrored, transposed
 from nerf_lightning.doctor.epipolar import agreeing, distances, parallax, places
 from nerf_lightning.doctor.examine import gather_evidence
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.nerf.geometry.cameras import project
+from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation, rotation_from_quaternion
 
 
 def judged(name, evidence):
@@ -34,6 +35,27 @@ def swapped(first, second):
     return c2w()[order]
 
 
+def w2c(poses):
+    rotation = flip_yz(poses)[:, :, :3].mT
+    return rotation, -rotation @ poses[:, :, 3:]
+
+
+def from_w2c(rotation, translation):
+    return flip_yz(torch.cat([rotation.mT, -rotation.mT @ translation], dim=-1))
+
+
+def with_centers(poses):
+    """The poses of a file that has centers where readers expect translations."""
+    return from_w2c(w2c(poses)[0], poses[:, :, 3:])
+
+
+def with_quaternions(poses):
+    """The poses of a file whose quaternions x, y, z, w are read as w, x, y, z."""
+    rotation, translation = w2c(poses)
+    xyzw = quaternion_from_rotation(rotation)[:, [1, 2, 3, 0]]
+    return from_w2c(rotation_from_quaternion(xyzw), translation)
+
+
 def test_a_sound_capture_has_nothing_wrong():
     checks = outcome(corner_evidence())
     assert {check.name: check.message for check in checks.values() if check.verdict == "wrong"} == {}
@@ -44,10 +66,18 @@ def test_a_sound_capture_has_nothing_wrong():
 @pytest.mark.parametrize(
     ("planted", "name", "says", "cure"),
     [
-        (axes(c2w(), (1.0, -1.0, -1.0)), "axes", "OpenCV", "Negate the second and third column"),
-        (inverted(c2w()), "axes", "look like world-to-camera rather", "Invert every pose matrix."),
-        (inverted(axes(c2w(), (1.0, -1.0, -1.0))), "axes", "as COLMAP writes them", "Invert every pose matrix, then"),
+        (axes(c2w(), (1.0, -1.0, -1.0)), "axes", "OpenCV", "Set scene.axes=opencv, or negate"),
+        (inverted(c2w()), "axes", "look like world-to-camera rather", "Set scene.poses=w2c, or invert"),
+        (
+            inverted(axes(c2w(), (1.0, -1.0, -1.0))),
+            "axes",
+            "as COLMAP writes them",
+            "scene.poses=w2c scene.axes=opencv",
+        ),
         (transposed(c2w()), "axes", "rotations were transposed", "Transpose every rotation"),
+        (mirrored(c2w()), "axes", "left-handed world", "Negate the third row and the third column"),
+        (with_centers(c2w()), "axes", "centers stood in the place of translations", "-R c"),
+        (with_quaternions(c2w()), "axes", "quaternions were x, y, z, w", "Write the quaternions as w, x, y, z"),
         (axes(c2w(), (-1.0, -1.0, 1.0)), "axes", "cameras' x and y axes", "Negate columns 1 and 2"),
         (c2w().roll(1, 0), "order of photographs", "pose of the next one", "by one"),
         (c2w().roll(-1, 0), "order of photographs", "pose of the previous one", "by one"),

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, TypeVar, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
@@ -28,6 +29,7 @@ from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
+from nerf_lightning.nerf.geometry.poses import flip_yz
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
 MOST_PIXELS = 640
@@ -40,6 +42,8 @@ DEEPEST, MOST_FOLDERS = 3, 1000
 """How far below a folder, and in how many folders of a level, captures are looked for."""
 
 Found = TypeVar("Found")
+Axes = Literal["opengl", "opencv"]
+Poses = Literal["c2w", "w2c"]
 LARGEST_STRETCH = 0.01
 """Of width and height: how far a picture's scale may differ from one axis to the other."""
 
@@ -61,6 +65,9 @@ class CaptureReader(Reader):
             masks that has one for each photograph. none: no masks.
         masks_keep: the color of masks that is kept, white or black; the other is ignored.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
+        axes: opengl, or opencv where the cameras in the files have axes right, down, forward although the format's are
+            others; the doctor recognizes it.
+        poses: c2w (camera to world), or w2c (world to camera) where the files have the inverse of the format's poses.
         near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
         metres_per_unit: length of the capture's unit in meters, if known: depths are then in meters, and GLB files have
@@ -83,6 +90,8 @@ class CaptureReader(Reader):
     masks: str | None = None
     masks_keep: MaskColor = "white"
     space: Spaces = "auto"
+    axes: Axes = "opengl"
+    poses: Poses = "c2w"
     near: float | None = None
     far: float | None = None
     metres_per_unit: float | None = None
@@ -109,7 +118,7 @@ class CaptureReader(Reader):
         """
         self._check_settings()
         with reading(self.root):
-            capture = self.capture()
+            capture = as_meant(self.capture(), self.axes, self.poses)
         capture = self._wanted(capture)
         if capture.splits is None and len(capture.views) > 1:
             # Before views are left out, so that the others keep their splits.
@@ -220,6 +229,8 @@ class CaptureReader(Reader):
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave no training views: give 2 or more.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
+        require_one_of(get_args(Axes), **{"scene.axes": self.axes})
+        require_one_of(get_args(Poses), **{"scene.poses": self.poses})
         check_metres(self.metres_per_unit)
         background_for(self.background, None, "black")
         check_extent(self.space, self.near, self.far)
@@ -311,6 +322,17 @@ def decoded(capture: Capture, read: Callable[[Sequence[View]], PixelStore]) -> t
             kept = [number for number in range(len(names)) if number not in error.faults]
             capture.left_out.require_enough(len(kept))
             capture = capture.some(kept)
+
+
+def as_meant(capture: Capture, axes: Axes, poses: Poses) -> Capture:
+    """Return a capture whose poses are camera to world with axes right, up, back, from what its files have instead."""
+
+    def turned(c2w: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        if poses == "w2c":
+            c2w = torch.cat([c2w[:, :3].mT, -c2w[:, :3].mT @ c2w[:, 3:]], dim=1)
+        return flip_yz(c2w) if axes == "opencv" else c2w
+
+    return replace(capture, views=tuple(replace(view, c2w=turned(view.c2w)) for view in capture.views))
 
 
 def as_calibrated(capture: Capture) -> Capture:

@@ -380,6 +380,22 @@ def test_a_view_that_is_listed_twice_counts_once_but_for_another_pose(root, capl
     assert ("more than once, with different poses" in caplog.text) == (views == 8)
 
 
+@pytest.mark.parametrize(
+    ("settings", "change"),
+    [
+        ({"axes": "opencv"}, lambda pose: pose @ np.diag([1.0, -1, -1, 1])),
+        ({"poses": "w2c"}, np.linalg.inv),
+        ({"axes": "opencv", "poses": "w2c"}, lambda pose: np.linalg.inv(pose @ np.diag([1.0, -1, -1, 1]))),
+    ],
+)
+def test_poses_of_another_convention_are_read_by_a_setting(root, plain, settings, change):
+    def changed(frame):
+        return frame | {"transform_matrix": change(np.array(frame["transform_matrix"])).tolist()}
+
+    edit_json(root, lambda content: content | {"frames": list(map(changed, content["frames"]))})
+    assert_plain(read(root, **settings), plain)
+
+
 def test_pictures_lie_anywhere_in_the_folder_that_the_user_named(tmp_path, plain):
     """As in ETH3D: a model beside the pictures' folder; and a json in a folder of its own."""
     root = write_colmap(tmp_path / "eth", KNOWN, where="calibration")
