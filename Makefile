@@ -70,7 +70,7 @@ test-slow: setup ## Run the tests that take minutes together: kernels compiled f
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
 
-test-core: setup ## Run the quick tests in a copy of the project without extensions
+test-core: setup ## Try the options and commands in a copy of the project without extensions; every test must be collected there
 	@$(VENV)/bin/python -m pytest -m "" tests/test_without_extensions.py
 
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
