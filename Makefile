@@ -70,7 +70,7 @@ test-slow: setup ## Run the tests that take minutes together: kernels compiled f
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
 
-test-core: setup ## Run the quick tests in a copy of the project without extensions
+test-core: setup ## Try the options and commands in a copy of the project without extensions; every test must be collected there
 	@$(VENV)/bin/python -m pytest -m "" tests/test_without_extensions.py
 
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
@@ -99,7 +99,7 @@ OTHER := $(if $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null),ATEN_CPU_
 OTHER_TESTS := tests/nerf/test_matmul_precision.py tests/nerf/test_disable_autocast.py tests/nerf/kernels tests/nerf/fields \
 	tests/nerf/models tests/nerf/rendering tests/nerf/samplers tests/training/test_step.py tests/commands/test_memory_plan.py \
 	tests/commands/test_trainer_settings.py tests/commands/test_train_eval_render.py tests/commands/test_processes.py \
-	tests/commands/test_fast_path.py
+	tests/commands/test_fast_path.py $(addprefix --ignore=tests/nerf/kernels/,test_gpu_targets.py test_backends.py)
 test-other: setup ## Run a part of the tests as on the other kind of CPU (bfloat16 on or off), with one thread
 	@echo "as another machine: $(OTHER) OMP_NUM_THREADS=1"
 	@$(OTHER) OMP_NUM_THREADS=1 $(PYTEST) $(OTHER_TESTS)

@@ -2,6 +2,8 @@
 
 import inspect
 import types
+from functools import cache
+from pathlib import Path
 from pydoc import locate
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -40,13 +42,19 @@ def required_path(key: str, value: object) -> str:
 
 def require_sections(config: DictConfig, command: str) -> None:
     """Refuse a word or number in the place of a whole section of settings of the command's own yaml."""
-    sections = OmegaConf.to_container(OmegaConf.load(conf_file(command)), resolve=False)
-    assert isinstance(sections, dict)
-    for key, section in ((str(key), section) for key, section in sections.items()):
+    for key, section in _sections(conf_file(command)).items():
         if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
             raise InputError(
                 f"{key}={config[key]} is not valid: it holds settings, such as {key}.{next(iter(section))}=VALUE."
             )
+
+
+@cache
+def _sections(file: Path) -> dict[str, Any]:
+    """Return what a yaml of ours holds."""
+    sections = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+    assert isinstance(sections, dict)
+    return {str(key): section for key, section in sections.items()}
 
 
 def _parameters(target: object, path: str) -> dict[str, inspect.Parameter]:

@@ -45,7 +45,7 @@ def address_in(process):
 
 @pytest.mark.slow
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
-    steps = "trainer.max_steps=240"  # Long enough for two people who come and go.
+    steps = "trainer.max_steps=160"  # Long enough for two people who come and go.
     alone = run(capture, tmp_path / "alone", steps)
     page = ("viewer=on", f"viewer.live_view.port={unused_port()}", "viewer.live_view.max_height=48")
     watched = run(capture, tmp_path / "watched", steps, *page)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from support import extensions
 from support.planted import in_config, write_checkpoint
-from support.running import FAST, refused, said
+from support.running import FAST, NO_LAYOUT, refused, said
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.commands.train_job.fit import resume_command
@@ -23,6 +23,7 @@ def test_yamls_of_ones_own_are_found_where_the_model_is_left_open(nerf, capture,
     where = f"--config-dir={Path(extensions.__file__).parent / 'conf'}"
     scene = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={tmp_path}/run")
     small = ("encoder.first.log2_table_size=8", "data.batch_rays=64", "trainer.max_steps=2", "trainer.tile_points=8192")
+    small += (NO_LAYOUT, "data.val_rays=64", "model.levels.fine.sampler.resolution=16")
     done = nerf("train", where, *scene, *small, "encoder=joined", "final.video=false", "final.evaluate=false")
     assert done.code == 0, done.err
 

@@ -139,7 +139,7 @@ def test_of_photographs_of_two_places_the_larger_part_is_taken_and_the_other_nam
     for number in range(4):  # another place, with other walls
         picture = Image.fromarray(photograph(corner_poses(4)[number], first_wall=3))
         picture.save(folder / f"elsewhere {number}.png")
-    result = poses(f"images={folder}", "num_features=600")
+    result = poses(f"images={folder}", "num_features=350")
     assert result.code == 0, result.err
     assert "registered          5 of 9 photographs" in result.out
     assert "elsewhere 3.png fit together but not with the rest: if they show another place, make a" in result.out
@@ -190,7 +190,7 @@ def test_photographs_left_out_are_named(poses, tmp_path):
         Image.open(folder / f"view {number}.png").crop((10, 0, 310, 240)).save(folder / f"view {number}.png")
     for number in range(3):
         Image.new("RGB", (200, 150), (60 * number, 90, 120)).save(folder / f"wall {number}.png")
-    result = poses(f"images={folder}", "num_features=600", "matching=sequential")
+    result = poses(f"images={folder}", "num_features=350", "matching=sequential")
     assert result.code == 0, result.err
     assert "registered          4 of 7 photographs (2 cameras, sequential matching)" in result.out
     assert "left out            wall 0.png, wall 1.png, wall 2.png" in result.out
@@ -206,7 +206,7 @@ def test_a_film_is_read_and_reconstructed(poses, tmp_path):
     write_corner(tmp_path / "frames", count=12)
     frames = [np.asarray(Image.open(tmp_path / "frames" / f"view {n}.png").convert("RGB")) for n in range(12)]
     imageio.imwrite(tmp_path / "film.mp4", np.stack(frames), plugin="FFMPEG", fps=10, quality=9)
-    result = poses(f"video={tmp_path / 'film.mp4'}", "every=2", "num_features=600")
+    result = poses(f"video={tmp_path / 'film.mp4'}", "every=2", "num_features=350")
     assert result.code == 0, result.err
     assert "registered          6 of 6 frames" in result.out
     assert len(list((tmp_path / "found" / "images").glob("frame_*.jpg"))) == 6

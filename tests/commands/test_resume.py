@@ -116,7 +116,7 @@ def scontrol(tmp_path, monkeypatch):
 
 def begin(capture, root, *more, **options):
     return start(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "logger=none", "trainer.max_steps=150",
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "logger=none", "trainer.max_steps=70",
         "final.evaluate=false", "final.video=false", f"paths.root_dir={root}", *more, **options,
     )  # fmt: skip
 
@@ -201,7 +201,7 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
     assert code == 0, output
     assert "resuming from step" in output
     assert len(list(root.rglob("run.json"))) == 1
-    assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 150
+    assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 70
 
 
 @pytest.mark.exhaustive
@@ -219,5 +219,5 @@ def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path)
     assert code == 0, output
     (log,) = folder.glob(".submitit/*/*_log.err")
     assert "resuming from step" in log.read_text()
-    assert json.loads((run / "run.json").read_text())["finished_at_step"] == 150
+    assert json.loads((run / "run.json").read_text())["finished_at_step"] == 70
     assert json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())["state"] == "finished"

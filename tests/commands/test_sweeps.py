@@ -124,7 +124,7 @@ def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
 @pytest.mark.slow
 @POSIX
 def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
-    longer = ("seed=0,1", "trainer.max_steps=80")
+    longer = ("seed=0,1", "trainer.max_steps=50")
     process = start(*arguments(capture, tmp_path, *longer))
     wait_for_step(tmp_path / "1_seed=1", 10, process)
     process.kill()
@@ -140,7 +140,7 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     assert "resuming from step" in output
     assert json.loads((tmp_path / "0_seed=0" / "run.json").read_text()) == before
     assert {row["state"] for row in table(tmp_path)} == {"finished before", "finished"}
-    assert {row["steps"] for row in table(tmp_path)} == {"80"}
+    assert {row["steps"] for row in table(tmp_path)} == {"50"}
 
 
 @pytest.mark.exhaustive

@@ -23,9 +23,12 @@ def bricks():
 
 def errors(scene, found):
     """Relative errors of the distances."""
-    pixels = found.pixels
-    depth = torch.cat([scene.truth(view).depth for view in range(len(scene.view_names))])
-    return (found.distance / depth[scene.pixels.index_of(pixels.view, pixels.x, pixels.y)] - 1.0).abs()
+    depth = torch.empty(len(found))
+    for view in found.pixels.view.unique().tolist():
+        there = found.pixels.view == view
+        truth = scene.truth(view).depth.view(int(scene.cameras.height[view]), -1)
+        depth[there] = truth[found.pixels.y[there], found.pixels.x[there]]
+    return (found.distance / depth - 1.0).abs()
 
 
 def test_distances_are_those_of_the_surfaces_that_training_views_show(bricks):

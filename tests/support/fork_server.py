@@ -39,7 +39,10 @@ READ_AT_IMPORT = ("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "NUMBA_", "PYTHO
                   "CUDA_", "TRITON_", "SLURM_CPUS_")  # fmt: skip
 # What commands import only once they need it.
 LAZY = ("torch.utils.tensorboard", "torchmetrics", "matplotlib.pyplot", "imageio.v3", "imageio_ffmpeg", "PIL.Image",
-        "lightning.pytorch", "hydra.main", "jinja2", "rich.console", "rich.progress")  # fmt: skip
+        "lightning.pytorch", "hydra.main", "jinja2", "rich.console", "rich.progress", "rich._emoji_codes",
+        "tensorboard.plugins.hparams.metadata", "fsspec.implementations.chained", "matplotlib.backends.backend_agg",
+        "PIL.JpegImagePlugin", "PIL.PngImagePlugin", "PIL.GifImagePlugin", "PIL.PpmImagePlugin", "PIL.BmpImagePlugin",
+        )  # fmt: skip
 # What most forks compose: a command, and what they pick of its groups.
 COMPOSED = (("train", "scene=npz", "model=nerf_tiny"), ("train", "scene=npz", "model=fast_small"), ("train",),
             ("eval",), ("render",), ("export",), ("view",), ("table",))  # fmt: skip
@@ -232,6 +235,11 @@ def import_everything() -> None:
             if not name.endswith(NOT_IMPORTED):
                 with contextlib.suppress(ImportError):
                     importlib.import_module(name)
+    from numba.core.registry import cpu_target
+
+    # What numba learns before its first kernel, also where that is in its cache: half a second.
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 
 
 def compose_quickly() -> None:

@@ -4,12 +4,13 @@ Which files are merged, and what they give, follows from the command and from th
 overrides of single settings are applied by Hydra each time. Processes that start from nothing compose without this.
 """
 
+import copy
 import pickle
 from pathlib import Path
 
 from hydra._internal import config_loader_impl, defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.config_repository import ConfigRepository
+from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
 from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
 from hydra.core.default_element import InputDefault, ResultDefault
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -39,6 +40,7 @@ def install() -> None:
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once
     # Not of a source of files: Hydra loads their classes anew when it looks for plugins.
     ConfigRepository.load_config = loaded_once
+    CachingConfigRepository.__init__ = copy_sources_only_if_changed
     if choices_map is not None:
         defaults_list._create_interpolation_map = map_if_needed
 
@@ -88,6 +90,11 @@ def loaded_once(repo: ConfigRepository, config_path: str) -> ConfigResult | None
     if key not in _files:
         _files[key] = pickle.dumps(loaded(repo, config_path))
     return pickle.loads(_files[key])
+
+
+def copy_sources_only_if_changed(caching: CachingConfigRepository, delegate: ConfigRepository) -> None:
+    """Copy what keeps the sources, which puts a new list of them in place where there are others."""
+    caching.delegate, caching.cache = copy.copy(delegate), {}
 
 
 def map_if_needed(overrides: Overrides, defaults: list[InputDefault], self_added: bool) -> DictConfig:

@@ -1,6 +1,7 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
 import atexit
+import gc
 import logging
 import os
 import sys
@@ -58,7 +59,9 @@ def pytest_collection():
     from nerf_lightning.cli.loading import quick_imports
 
     with quick_imports():
-        return (yield)
+        collected = yield
+    gc.freeze()  # what is there for good need not be looked through again and again
+    return collected
 
 
 @pytest.hookimpl(tryfirst=True)

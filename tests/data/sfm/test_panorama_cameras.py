@@ -20,6 +20,7 @@ from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 
+HEIGHT = 192
 WHOLE, NEARLY, PART, PLAIN = (512, 256), (512, 254), (512, 128), (512, 384)
 
 
@@ -102,10 +103,10 @@ def test_colmap_and_we_see_the_same_directions_in_them():
 @pytest.mark.slow
 def test_panoramas_of_a_room_are_placed_and_read_with_the_distances_of_its_walls(tmp_path):
     pytest.importorskip("pycolmap", minversion="4.1")
-    true = write_room(tmp_path / "walk")
-    settings = SfmSettings(num_features=800)
+    true = write_room(tmp_path / "walk", count=9, height=HEIGHT)
+    settings = SfmSettings(num_features=400)
     model, _ = from_photographs(tmp_path / "walk", tmp_path / "found", settings)
-    assert (len(model.registered), model.left_out, model.num_cameras) == (12, (), 1)
+    assert (len(model.registered), model.left_out, model.num_cameras) == (9, (), 1)
     assert model.reprojection_error < 0.5
     poses = colmap_poses(tmp_path / "found" / "sparse" / "0")
     found = np.array([poses[name] for name in sorted(poses)])
@@ -116,10 +117,10 @@ def test_panoramas_of_a_room_are_placed_and_read_with_the_distances_of_its_walls
     # The folder is one of a known format now.
     scene = PhotosReader(root=str(tmp_path / "found"), cache_dir=str(tmp_path / "cache")).read()
     assert scene.cameras.lens_model == "equirectangular"
-    assert len(scene.depths) > 1000
+    assert len(scene.depths) > 400
     pixels, walls = scene.depths.pixels, []
     for view, x, y in torch.stack([pixels.view, pixels.x, pixels.y], dim=-1).numpy():
-        toward = directions(true[view], x + 0.5, y + 0.5, height=256)
+        toward = directions(true[view], x + 0.5, y + 0.5, height=HEIGHT)
         walls.append(to_walls(true[view][:, 3], toward).min())
     metres = unit_of(scene.to_user) * umeyama(found[:, :, 3], true[:, :, 3])[0] * scene.depths.distance.numpy()
     # Within a pixel, a wall at a grazing angle is here and there.

@@ -11,6 +11,7 @@ from types import ModuleType
 import numba
 import pytest
 import torch
+from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
@@ -144,8 +145,9 @@ def kernel():
 ASKED = """
 import numba, os, sys
 from pathlib import Path
-room = Path("room").absolute()
+room, numba.config.CACHE_DIR = Path("room").absolute(), os.path.abspath("kept")
 sys.path.insert(0, str(room.parent))
+sys.dont_write_bytecode = True
 from nerf_lightning.nerf.kernels import backends
 backends.ROOM = room.name
 numba.njit(lambda: 1)()  # so that each finds the compiler ready
@@ -167,10 +169,10 @@ def returned(tmp_path, *numbers):
     (room / "__init__.py").touch()
     if not (room / "kernel.py").exists():  # numba compares its time of change
         (room / "kernel.py").write_text(KERNEL)
-    asked = [sys.executable, "-c", ASKED, *map(str, numbers)]
-    more = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(asked, env=os.environ | more, cwd=tmp_path, capture_output=True, text=True, check=True)
-    return done.stdout.splitlines()
+    process = start_code(ASKED, *numbers, cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return output.splitlines()
 
 
 @POSIX
