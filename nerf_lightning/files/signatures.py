@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 from nerf_lightning.files.regular import open_regular
@@ -29,13 +30,14 @@ def files_with(folder: Path, signature: Signature) -> Iterator[str]:
     else:
         paths = [folder / pattern] if (folder / pattern).exists() else []
     for path in paths[:MOST_FILES] if words else paths:
-        if begins(path, words):
+        if fits(path, signature):
             yield path.relative_to(folder).as_posix()
 
 
-def begins(path: Path, words: str) -> bool:
-    """Return whether the beginning of a file contains a regular expression; "" is in any."""
-    return not words or re.search(words, beginning(path)) is not None
+def fits(path: Path, signature: Signature) -> bool:
+    """Return whether a file has the name and the words of a signature, wherever it lies."""
+    pattern, words = signature
+    return fnmatch(path.name, pattern.rpartition("/")[2]) and (not words or bool(re.search(words, beginning(path))))
 
 
 def beginning(path: Path) -> str:

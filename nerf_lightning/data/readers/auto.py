@@ -142,7 +142,8 @@ class AutoReader(CaptureReader):
         if not fitting or not os.path.isfile(path):
             return None
         likeliest = [each for each in fitting if each in FIRST] or fitting
-        reader = next((each for each in fitting if each.found_in(path.parent) == path.name), likeliest[-1])
+        known = (each for each in fitting if path.name in (each.found_in(path), each.found_in(path.parent)))
+        reader = next(known, likeliest[-1])
         return Known(self.folder(), path.name, reader)
 
     def _hint(self) -> str:
@@ -181,9 +182,17 @@ OF_OTHERS: tuple[tuple[tuple[Signature, ...], str], ...] = (
         "cfg_args names as source_path.",
     ),
     (
+        (("camera*.json", '"projection_type"'),),
+        "It holds cameras of OpenSfM or ODM, but not their poses: copy reconstruction.json there (of an ODM project, "
+        "opensfm/reconstruction.json).",
+    ),
+    (
+        (("*.mg", ""),),
+        "A .mg is a project of Meshroom: give the folder in MeshroomCache/StructureFromMotion that holds cameras.sfm.",
+    ),
+    (
         (("*.nvm", r"\ANVM_V3"),),
-        "A .nvm is a model of VisualSFM: COLMAP reads its photographs anew (nerf poses), or converts it with "
-        "`colmap model_converter`'s input from Bundler: export bundle.out from VisualSFM.",
+        "A .nvm is a model of VisualSFM: export it as a Bundler file (bundle.out and list.txt), or use nerf poses.",
     ),
     (
         (("*.sens", ""),),

@@ -63,6 +63,8 @@ class NerfiesReader(PosedReader):
             raise InputError(f"{root} of {self.program} has no pictures in {' or '.join(wanted)}. Copy them there.")
         found = self.posed(path, numbered("ids", ids), lambda name, where: _posed(root, name, where), folder, folder)
         _say_that_it_moves(root, ids)
+        if (root / "depth").is_dir():
+            log.info("%s: depth maps are not read", root)
         stems = [Path(view.name).stem for view in found.views]
         splits = {
             split: tuple(stems.index(each) for each in map(str, content.get(f"{split}_ids") or ()) if each in stems)

@@ -70,7 +70,7 @@ class OpenSfmReader(PosedReader):
             path = next((place for place, pictures in folders.items() if pictures_below(pictures)), path)
         pictures = folders.get(path, root)
         folder = pictures if pictures_below(pictures) else None
-        if not pictures_below(root):
+        if folder is None and all("undistorted" in picture.relative_to(root).parts for picture in pictures_below(root)):
             raise InputError(
                 f"{root} of {self.program} holds no photographs. Give the folder that holds images and "
                 "reconstruction.json, or the ODM project, which holds images and opensfm."

@@ -7,7 +7,6 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
@@ -26,7 +25,7 @@ from nerf_lightning.extensions.other_formats.posed import (
 from nerf_lightning.extensions.other_formats.text_poses import first_numbers, intrinsics_of
 from nerf_lightning.files.json_files import mapping, read_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.files.signatures import Signature
+from nerf_lightning.files.signatures import Signature, fits
 from nerf_lightning.messages.errors import InputError
 
 CURE = "Copy it again."
@@ -171,4 +170,4 @@ class PoseFilesReader(PosedReader):
 
 def _layout_of(path: Path) -> Layout:
     """Return the layout of a file that has the signature of one."""
-    return next(each for each in LAYOUTS if fnmatch(path.name, each.signature[0].rpartition("/")[2]))
+    return next(each for each in LAYOUTS if fits(path, each.signature))

@@ -21,7 +21,7 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.signatures import Signature, file_with, files_with
+from nerf_lightning.files.signatures import Signature, file_with, files_with, fits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.frames import unit_of
@@ -78,7 +78,9 @@ class PosedReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is known, where a folder has it, or is that file itself."""
+        if folder.is_file():
+            return folder.name if any(fits(folder, signature) for signature in cls.signatures) else None
         return next((file for signature in cls.signatures if (file := file_with(folder, signature))), None)
 
     @abstractmethod
@@ -187,7 +189,7 @@ def from_rotation_and_center(rotation: list[float], center: list[float], where: 
 
 
 def numbers(value: object, count: int, where: str) -> list[float]:
-    """Return so many numbers of nested lists, in order, which json may also hold as text.
+    """Return the numbers of nested lists, in order, which json may also hold as text.
 
     >>> numbers([[1, 0], ["0.5", 2]], 4, "a.json: matrix")
     [1.0, 0.0, 0.5, 2.0]
@@ -198,7 +200,8 @@ def numbers(value: object, count: int, where: str) -> list[float]:
             return [float(each) for each in found]
     except (TypeError, ValueError, OverflowError):
         pass
-    raise InputError(f"{where} must be {count} numbers, but it is {str(value)[:80]}. {CURE}")
+    wanted, is_ = "a number" if count == 1 else f"{count} numbers", "missing" if value is None else str(value)[:80]
+    raise InputError(f"{where} must be {wanted}, but it is {is_}. {CURE}")
 
 
 def number(content: dict[str, Any], key: str, where: str, default: object = None) -> float:

@@ -31,7 +31,7 @@ class SplatCamerasReader(PosedReader):
     """
 
     program = "3DGS"
-    signatures = (("cameras.json", r'\A\s*\[\s*\{[^{}]*"(img_name|rotation|position)"'),)
+    signatures = tuple((name, r'\A\s*\[\s*\{[^{}]*"img_name"') for name in ("cameras.json", "*.json"))
 
     name: str = "splat_cameras"
 

@@ -26,7 +26,7 @@ from nerf_lightning.extensions.other_formats.posed import (
 )
 from nerf_lightning.files.json_files import mapping, read_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.files.signatures import Signature, begins
+from nerf_lightning.files.signatures import Signature, fits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
@@ -218,7 +218,7 @@ class TrajectoryReader(PosedReader):
 
     program = "TUM, Replica, Tanks and Temples, RealEstate10K or Stray Scanner"
     signatures = tuple(each.signature for each in FORMATS)
-    named_by = (".log", ".txt", ".csv")
+    named_by = (".log",)
 
     name: str = "trajectory"
     intrinsics: list[float] | None = None
@@ -261,7 +261,7 @@ class TrajectoryReader(PosedReader):
 
 
 def _format_of(path: Path) -> Format:
-    found = next((each for each in FORMATS if begins(path, each.signature[1])), None)
+    found = next((each for each in FORMATS if fits(path, each.signature)), None)
     if found is None:
         raise InputError(f"{path} is no file with poses of {TrajectoryReader.program}. Give another one.")
     return found
