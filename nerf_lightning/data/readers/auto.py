@@ -177,7 +177,7 @@ OF_OTHERS: tuple[tuple[tuple[Signature, ...], str], ...] = (
         "XMP files next to photographs are RealityScan's cameras: export its COLMAP format instead.",
     ),
     (
-        (("cfg_args", "source_path"),),
+        (("point_cloud", ""),),
         "It looks like the output of 3DGS (Gaussian splats): read the capture that it was made of, whose folder "
         "cfg_args names as source_path.",
     ),

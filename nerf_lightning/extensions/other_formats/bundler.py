@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import torch
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -31,47 +31,35 @@ FOCAL_BEHIND = re.compile(r"\s+0(\s+[-+.\deE]+)?$")
 """What may follow a name in such a list."""
 
 
-@dataclass
-class BundlerReader(PosedReader):
+def _read(reader: PosedReader, path: Path) -> Capture:
     """Read the cameras with a focal length; others have no pose. The principal point is the picture's middle.
 
     A pose is world to camera with axes right, up, back.
     """
-
-    program = "Bundler"
-    signatures = (("*.out", r"\A# Bundle file"),)
-    named_by = (".out",)
-
-    name: str = "bundler"
-
-    def capture(self) -> Capture:
-        """Return all cameras, in the file's order."""
-        path = self.source()
-        names = self._names(path)
-        with open_regular(path, None) as file:
-            lines = (line for line in read_lines(file, encoding_of(file)) if not line.startswith("#") and line.strip())
-            count, points = (int(number) for number in _numbers(lines, 1, 2, path))
-            require_within("views", count, path, "views")
-            require_within("points", points, path, "points")
-            cameras = [_numbers(lines, 5, 15, path) for _ in range(count)]
-            found = [_numbers(islice(lines, 3), 1, 3, path) for _ in range(points)]
-        if count != len(names):
-            raise InputError(
-                f"{path} has {count} cameras, but the list beside it names {len(names)} pictures. Export both again."
-            )
-        posed = {f"camera {number}": pair for number, pair in enumerate(zip(names, cameras, strict=True)) if pair[1][0]}
-        capture = self.posed(path, posed, _posed, path.parent, points=sparse_points(found, path))
-        capture.left_out.without_pose = tuple(
-            name for name, numbers in zip(names, cameras, strict=True) if not numbers[0]
+    names = _names(path)
+    with open_regular(path, None) as file:
+        lines = (line for line in read_lines(file, encoding_of(file)) if not line.startswith("#") and line.strip())
+        count, points = (int(number) for number in _numbers(lines, 1, 2, path))
+        require_within("views", count, path, "views")
+        require_within("points", points, path, "points")
+        cameras = [_numbers(lines, 5, 15, path) for _ in range(count)]
+        found = [_numbers(islice(lines, 3), 1, 3, path) for _ in range(points)]
+    if count != len(names):
+        raise InputError(
+            f"{path} has {count} cameras, but the list beside it names {len(names)} pictures. Export both again."
         )
-        return capture
+    posed = {f"camera {number}": pair for number, pair in enumerate(zip(names, cameras, strict=True)) if pair[1][0]}
+    capture = reader.posed(path, posed, _posed, path.parent, points=sparse_points(found, path))
+    capture.left_out.without_pose = tuple(name for name, numbers in zip(names, cameras, strict=True) if not numbers[0])
+    return capture
 
-    def _names(self, path: Path) -> list[str]:
-        found = next((name for pattern in LISTS if (name := file_with(path.parent, (pattern, "")))), None)
-        if found is None:
-            raise InputError(f"{path} of Bundler needs a list of its pictures beside it, such as list.txt.")
-        lines = read_text(path.parent / found, "text", CURE).splitlines()
-        return [FOCAL_BEHIND.sub("", line.strip()) for line in lines if line.strip()]
+
+def _names(path: Path) -> list[str]:
+    found = next((name for pattern in LISTS if (name := file_with(path.parent, (pattern, "")))), None)
+    if found is None:
+        raise InputError(f"{path} of Bundler needs a list of its pictures beside it, such as list.txt.")
+    lines = read_text(path.parent / found, "text", CURE).splitlines()
+    return [FOCAL_BEHIND.sub("", line.strip()) for line in lines if line.strip()]
 
 
 def _numbers(lines: Iterator[str], rows: int, count: int, path: Path) -> list[float]:
@@ -101,3 +89,6 @@ def _posed(item: tuple[str, list[float]], where: str) -> Posed:
         )
 
     return Posed(name, where, camera)
+
+
+FORMAT = Format("Bundler", (("*.out", r"\A# Bundle file"),), _read)

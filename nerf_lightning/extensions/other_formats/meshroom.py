@@ -1,6 +1,7 @@
 """Meshroom's cameras (AliceVision): `cameras.sfm` or `sfm.json`, with views, intrinsics and poses by their numbers."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.readers.frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -41,33 +43,22 @@ DEFAULT_SENSOR = 36.0
 """Width in millimeters where none is said."""
 
 
-@dataclass
-class MeshroomReader(PosedReader):
+def _read(reader: PosedReader, path: Path) -> Capture:
     """Read the views that have a pose. A rotation is world to camera, by columns; cameras of a rig are composed."""
-
-    program = "Meshroom (AliceVision)"
-    signatures = (("*.sfm", '"(viewId|intrinsicId)"'), ("*.json", '"(viewId|intrinsicId)"'))
-    named_by = (".sfm", ".json")
-
-    name: str = "meshroom"
-
-    def capture(self) -> Capture:
-        """Return all views with a pose, in the file's order."""
-        path = self.source()
-        content = read_json(path)
-        views = entries(content, "views", f"{path} of {self.program}")
-        file = _File.read(content, str(path))
-        unposed = tuple(str(view.get("path")) for view in views if isinstance(view, dict) and file.has_no_pose(view))
-        posed = [view for view in views if not (isinstance(view, dict) and file.has_no_pose(view))]
-        if not posed:
-            raise InputError(
-                f"{path} of {self.program} has no poses: take the file that the node StructureFromMotion has written."
-            )
-        structure = entries({"structure": content.get("structure") or []}, "structure", str(path))
-        points = sparse_points([mapping(point).get("X") for point in structure], path)
-        found = self.posed(path, numbered("views", posed), file.posed, points=points)
-        found.left_out.without_pose = unposed
-        return found
+    content = read_json(path)
+    views = entries(content, "views", f"{path} of Meshroom (AliceVision)")
+    file = _File.read(content, str(path))
+    unposed = tuple(str(view.get("path")) for view in views if isinstance(view, dict) and file.has_no_pose(view))
+    posed = [view for view in views if not (isinstance(view, dict) and file.has_no_pose(view))]
+    if not posed:
+        raise InputError(
+            f"{path} of Meshroom (AliceVision) has no poses: take what the node StructureFromMotion has written."
+        )
+    structure = entries({"structure": content.get("structure") or []}, "structure", str(path))
+    points = sparse_points([mapping(point).get("X") for point in structure], path)
+    found = reader.posed(path, numbered("views", posed), file.posed, points=points)
+    found.left_out.without_pose = unposed
+    return found
 
 
 @dataclass(frozen=True)
@@ -157,3 +148,7 @@ def _opencv_pose(transform: dict[str, Any], where: str) -> Pose:
     rotation = torch.tensor(numbers(transform.get("rotation"), 9, f"{where}: rotation"), dtype=torch.float64)
     center = torch.tensor(numbers(transform.get("center"), 3, f"{where}: center"), dtype=torch.float64)
     return pose_from_matrix(torch.cat([rotation.reshape(3, 3), center[:, None]], dim=1), where)
+
+
+WORDS = '"(viewId|intrinsicId)"'
+FORMAT = Format("Meshroom (AliceVision)", (("*.sfm", WORDS), ("*.json", WORDS)), _read)

@@ -1,7 +1,6 @@
 """Nerfies' and HyperNeRF's captures (also DyCheck's): `dataset.json`, `camera/` with a json each, `rgb/1x`, ..."""
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.pictures import pictures_below
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -32,47 +32,31 @@ MOVING = ("warp_id", "time_id", "appearance_id")
 log = logging.getLogger(__name__)
 
 
-@dataclass
-class NerfiesReader(PosedReader):
-    """Read the pictures of the largest size. An orientation is world to camera, by rows, beside the position.
+def _read(reader: PosedReader, path: Path) -> Capture:
+    """Read the pictures of the largest size. An orientation is world to camera, by rows, beside the position."""
+    root = path.parent
+    content = read_json(path)
+    ids = [str(each) for each in entries(content, "ids", f"{path} of Nerfies or HyperNeRF")]
+    wanted = [reader.images] if reader.images else FOLDERS
+    folder = next((root / name for name in wanted if pictures_below(root / name)), None)
+    if folder is None:
+        raise InputError(f"{root} of Nerfies or HyperNeRF has no pictures in {' or '.join(wanted)}. Copy them there.")
+    found = reader.posed(path, numbered("ids", ids), lambda name, where: _posed(root, name, where), folder, folder)
+    _say_that_it_moves(root, ids)
+    if (root / "depth").is_dir():
+        log.info("%s: depth maps are not read", root)
+    stems = [Path(view.name).stem for view in found.views]
+    splits = {
+        split: tuple(stems.index(each) for each in map(str, content.get(f"{split}_ids") or ()) if each in stems)
+        for split in ("train", "val")
+    }
+    given = splits | {"test": splits["val"]} if splits["train"] and splits["val"] else None
+    bounds = _bounds(root, len(stems))
+    return Capture(found.views, path, found.lens_model, bounds=bounds, splits=given, left_out=found.left_out)
 
-    Args:
-        images: the folder of the pictures below root; null: the first of rgb/1x, rgb/2x, ... that has any.
-    """
 
-    program = "Nerfies or HyperNeRF"
-    signatures = (("dataset.json", '"(ids|train_ids)"'),)
-
-    name: str = "nerfies"
-    images: str | None = None
-
-    @classmethod
-    def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
-        return super().found_in(folder) if (folder / "camera").is_dir() else None
-
-    def capture(self) -> Capture:
-        """Return all pictures, in the file's order."""
-        root = self.folder()
-        path = root / "dataset.json"
-        content = read_json(path)
-        ids = [str(each) for each in entries(content, "ids", f"{path} of {self.program}")]
-        wanted = [self.images] if self.images else FOLDERS
-        folder = next((root / name for name in wanted if pictures_below(root / name)), None)
-        if folder is None:
-            raise InputError(f"{root} of {self.program} has no pictures in {' or '.join(wanted)}. Copy them there.")
-        found = self.posed(path, numbered("ids", ids), lambda name, where: _posed(root, name, where), folder, folder)
-        _say_that_it_moves(root, ids)
-        if (root / "depth").is_dir():
-            log.info("%s: depth maps are not read", root)
-        stems = [Path(view.name).stem for view in found.views]
-        splits = {
-            split: tuple(stems.index(each) for each in map(str, content.get(f"{split}_ids") or ()) if each in stems)
-            for split in ("train", "val")
-        }
-        given = splits | {"test": splits["val"]} if splits["train"] and splits["val"] else None
-        bounds = _bounds(root, len(stems))
-        return Capture(found.views, path, found.lens_model, bounds=bounds, splits=given, left_out=found.left_out)
+def _suits(folder: Path) -> bool:
+    return (folder / "camera").is_dir()
 
 
 def _posed(root: Path, name: str, where: str) -> Posed:
@@ -114,3 +98,6 @@ def _bounds(root: Path, views: int) -> Float[Tensor, "views 2"] | None:
         return None
     scale, near, far = (number(said, key, str(root / "scene.json")) for key in ("scale", "near", "far"))
     return torch.tensor([[near / scale, far / scale]], dtype=torch.float64).expand(views, 2) if scale > 0 else None
+
+
+FORMAT = Format("Nerfies or HyperNeRF", (("dataset.json", '"(ids|train_ids)"'),), _read, _suits)

@@ -1,11 +1,12 @@
 """openMVG's `sfm_data.json`: views, intrinsics and poses by their numbers, as cereal writes them."""
 
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.readers.frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -35,48 +36,38 @@ IS_NEW = 1 << 31
 """What cereal adds to the number of a type where it is named for the first time."""
 
 
-@dataclass
-class OpenMvgReader(PosedReader):
+def _read(reader: PosedReader, path: Path) -> Capture:
     """Read the views that have a pose. A rotation is world to camera, by rows, beside the camera's center."""
+    content = read_json(path)
+    where = f"{path} of openMVG"
+    poses, cameras = _by_key(content, "extrinsics", where), _intrinsics(content, where)
+    if not poses:
+        raise InputError(f"{where} has no poses (extrinsics): take the file that the reconstruction has written.")
+    views = {f"views {key}": _data(value) for key, value in _by_key(content, "views", where).items()}
+    posed = {place: view for place, view in views.items() if view.get("id_pose") in poses}
 
-    program = "openMVG"
-    signatures = (("sfm_data*.json", '"sfm_data_version"'), ("*.json", '"sfm_data_version"'))
+    def picture(view: dict[str, Any], where: str) -> Posed:
+        name = path_of(view.get("filename"), "filename", where)
+        folder, intrinsic = view.get("local_path") or "", view.get("id_intrinsic")
 
-    name: str = "openmvg"
+        def camera(_: Size) -> tuple[Pose, Intrinsics]:
+            if intrinsic not in cameras:
+                raise InputError(f"{where} has id_intrinsic {intrinsic}, which is not among the intrinsics.")
+            pose = mapping(poses[view["id_pose"]])
+            rotation = numbers(pose.get("rotation"), 9, f"{where}: rotation")
+            center = numbers(pose.get("center"), 3, f"{where}: center")
+            said, kind = cameras[intrinsic]
+            return from_rotation_and_center(rotation, center, where), _camera(said, kind, f"{where}: intrinsics")
 
-    def capture(self) -> Capture:
-        """Return all views with a pose, in the file's order."""
-        path = self.source()
-        content = read_json(path)
-        where = f"{path} of openMVG"
-        poses, cameras = _by_key(content, "extrinsics", where), _intrinsics(content, where)
-        if not poses:
-            raise InputError(f"{where} has no poses (extrinsics): take the file that the reconstruction has written.")
-        views = {f"views {key}": _data(value) for key, value in _by_key(content, "views", where).items()}
-        posed = {place: view for place, view in views.items() if view.get("id_pose") in poses}
+        return Posed(f"{folder}/{name}" if isinstance(folder, str) and folder else name, where, camera)
 
-        def picture(view: dict[str, Any], where: str) -> Posed:
-            name = path_of(view.get("filename"), "filename", where)
-            folder, intrinsic = view.get("local_path") or "", view.get("id_intrinsic")
-
-            def camera(_: Size) -> tuple[Pose, Intrinsics]:
-                if intrinsic not in cameras:
-                    raise InputError(f"{where} has id_intrinsic {intrinsic}, which is not among the intrinsics.")
-                pose = mapping(poses[view["id_pose"]])
-                rotation = numbers(pose.get("rotation"), 9, f"{where}: rotation")
-                center = numbers(pose.get("center"), 3, f"{where}: center")
-                said, kind = cameras[intrinsic]
-                return from_rotation_and_center(rotation, center, where), _camera(said, kind, f"{where}: intrinsics")
-
-            return Posed(f"{folder}/{name}" if isinstance(folder, str) and folder else name, where, camera)
-
-        structure = _by_key(content, "structure", where) if mapping(content).get("structure") else {}
-        points = sparse_points([mapping(point).get("X") for point in structure.values()], path)
-        found = self.posed(path, posed, picture, points=points)
-        found.left_out.without_pose = tuple(
-            str(view.get("filename")) for place, view in views.items() if place not in posed
-        )
-        return found
+    structure = _by_key(content, "structure", where) if mapping(content).get("structure") else {}
+    points = sparse_points([mapping(point).get("X") for point in structure.values()], path)
+    found = reader.posed(path, posed, picture, points=points)
+    found.left_out.without_pose = tuple(
+        str(view.get("filename")) for place, view in views.items() if place not in posed
+    )
+    return found
 
 
 def _by_key(content: object, name: str, where: str) -> dict[Any, Any]:
@@ -121,3 +112,6 @@ def _camera(said: dict[str, Any], kind: str, where: str) -> Intrinsics:
     focal = number(base, "focal_length", where)
     x, y = numbers(base.get("principal_point"), 2, f"{where}: principal_point")
     return Intrinsics((focal, focal), (x, y), (width, height), lens_model, (k1, k2, k3, k4, p1, p2))
+
+
+FORMAT = Format("openMVG", (("sfm_data*.json", '"sfm_data_version"'), ("*.json", '"sfm_data_version"')), _read)

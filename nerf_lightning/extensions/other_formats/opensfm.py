@@ -2,7 +2,6 @@
 
 import logging
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.pictures import pictures_below
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -50,48 +50,39 @@ PANORAMAS = ("spherical", "equirectangular")
 log = logging.getLogger(__name__)
 
 
-@dataclass
-class OpenSfmReader(PosedReader):
+def _read(reader: PosedReader, path: Path) -> Capture:
     """Read the largest reconstruction. Its frame is local: east, north, up in meters where photographs have GPS.
 
     A shot's rotation is an axis times an angle, world to camera. Lengths in a picture are in units of its longer side.
     """
+    root = reader.folder()
+    folders = {root / place: root / pictures for place, pictures in PLACES.items() if (root / place).is_file()}
+    if not os.path.isfile(Path(reader.root).expanduser()):  # the first whose photographs are there
+        path = next((place for place, pictures in folders.items() if pictures_below(pictures)), path)
+    pictures = folders.get(path, root)
+    folder = pictures if pictures_below(pictures) else None
+    if folder is None and all("undistorted" in picture.relative_to(root).parts for picture in pictures_below(root)):
+        raise InputError(
+            f"{root} of OpenSfM or ODM holds no photographs. Give the folder that holds images and "
+            "reconstruction.json, or the ODM project, which holds images and opensfm."
+        )
+    found = _largest(path)
+    cameras = mapping(found.get("cameras"))
 
-    program = "OpenSfM or ODM"
-    signatures = tuple((place, r"\A\s*\[") for place in PLACES)
+    def posed(shot: tuple[str, Any], where: str) -> Posed:
+        name, said = shot[0], mapping(shot[1])
 
-    name: str = "opensfm"
+        def camera(_: Size) -> tuple[Pose, Intrinsics]:
+            key = said.get("camera")
+            if not isinstance(key, str) or key not in cameras:
+                raise InputError(f"{where} has the camera {key}, which is not among the cameras of {path}.")
+            return _pose(said, where), _intrinsics(mapping(cameras[key]), f"{path}: cameras.{key}")
 
-    def capture(self) -> Capture:
-        """Return the shots, in the file's order."""
-        path, root = self.source(), self.folder()
-        folders = {root / place: root / pictures for place, pictures in PLACES.items() if (root / place).is_file()}
-        if not os.path.isfile(Path(self.root).expanduser()):  # the first whose photographs are there
-            path = next((place for place, pictures in folders.items() if pictures_below(pictures)), path)
-        pictures = folders.get(path, root)
-        folder = pictures if pictures_below(pictures) else None
-        if folder is None and all("undistorted" in picture.relative_to(root).parts for picture in pictures_below(root)):
-            raise InputError(
-                f"{root} of {self.program} holds no photographs. Give the folder that holds images and "
-                "reconstruction.json, or the ODM project, which holds images and opensfm."
-            )
-        found = _largest(path)
-        cameras = mapping(found.get("cameras"))
+        return Posed(name, where, camera)
 
-        def posed(shot: tuple[str, Any], where: str) -> Posed:
-            name, said = shot[0], mapping(shot[1])
-
-            def camera(_: Size) -> tuple[Pose, Intrinsics]:
-                key = said.get("camera")
-                if not isinstance(key, str) or key not in cameras:
-                    raise InputError(f"{where} has the camera {key}, which is not among the cameras of {path}.")
-                return _pose(said, where), _intrinsics(mapping(cameras[key]), f"{path}: cameras.{key}")
-
-            return Posed(name, where, camera)
-
-        shots = {f"shots.{name}": (name, shot) for name, shot in mapping(found.get("shots")).items()}
-        points = [mapping(point).get("coordinates") for point in mapping(found.get("points")).values()]
-        return self.posed(path, shots, posed, folder, folder, points=sparse_points(points, path))
+    shots = {f"shots.{name}": (name, shot) for name, shot in mapping(found.get("shots")).items()}
+    points = [mapping(point).get("coordinates") for point in mapping(found.get("points")).values()]
+    return reader.posed(path, shots, posed, folder, folder, points=sparse_points(points, path))
 
 
 def _largest(path: Path) -> dict[str, Any]:
@@ -136,3 +127,6 @@ def _intrinsics(camera: dict[str, Any], where: str) -> Intrinsics:
     y = number(camera, "focal_y", where, x)
     center = width / 2 + unit * number(camera, "c_x", where, 0.0), height / 2 + unit * number(camera, "c_y", where, 0.0)
     return Intrinsics((unit * x, unit * y), center, (width, height), lens_model, (k1, k2, k3, k4, p1, p2))
+
+
+FORMAT = Format("OpenSfM or ODM", tuple((place, r"\A\s*\[") for place in PLACES), _read)

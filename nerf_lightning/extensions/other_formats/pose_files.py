@@ -7,12 +7,14 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -25,7 +27,7 @@ from nerf_lightning.extensions.other_formats.posed import (
 from nerf_lightning.extensions.other_formats.text_poses import first_numbers, intrinsics_of
 from nerf_lightning.files.json_files import mapping, read_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.files.signatures import Signature, fits
+from nerf_lightning.files.signatures import Signature
 from nerf_lightning.messages.errors import InputError
 
 CURE = "Copy it again."
@@ -46,7 +48,7 @@ class Layout:
     """Of the files of poses; * is what they are called."""
     pictures: tuple[str, ...]
     """Of a picture without ending, where {} is what its pose is called; the first whose folder has pictures."""
-    camera: Callable[["PoseFilesReader", Path, Size], tuple[Pose, Intrinsics]]
+    camera: Callable[[PosedReader, Path, Size], tuple[Pose, Intrinsics]]
     """Reads the file of a pose, whose picture has (width, height) pixels."""
     depth: str | None = None
     """Of the depth maps beside the poses, in millimeters."""
@@ -54,14 +56,14 @@ class Layout:
     """Whether there are poses of which no picture was kept."""
 
 
-def _scannet(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Pose, Intrinsics]:
+def _scannet(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
     """Read a camera to world; the color camera's matrix is that of all."""
     matrix = first_numbers(path.parent.parent / "intrinsic" / "intrinsic_color.txt")
     (fx, fy, cx, cy), size = intrinsics_of(matrix, (int(size[0]), int(size[1])))
     return from_opencv(first_numbers(path)[:16], str(path)), Intrinsics((fx, fy), (cx, cy), size)
 
 
-def _seven_scenes(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Pose, Intrinsics]:
+def _seven_scenes(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
     """Read a camera to world; 12-Scenes and BundleFusion have the intrinsics in info.txt."""
     pose = from_opencv(first_numbers(path)[:16], str(path))
     info = next((file for folder in path.parents[:2] if (file := folder / "info.txt").is_file()), None)
@@ -75,7 +77,7 @@ def _seven_scenes(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Po
     return pose, Intrinsics((matrix[0], matrix[5]), (matrix[2], matrix[6]), (width, height))
 
 
-def _mvsnet(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Pose, Intrinsics]:
+def _mvsnet(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
     """Read a world to camera, and the camera's matrix."""
     match = MVSNET.match(read_text(path, "text", CURE))
     if match is None:
@@ -84,7 +86,7 @@ def _mvsnet(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Pose, In
     return from_world_to_camera(pose, str(path)), Intrinsics((matrix[0], matrix[4]), (matrix[2], matrix[5]), size)
 
 
-def _scanner_app(reader: "PoseFilesReader", path: Path, size: Size) -> tuple[Pose, Intrinsics]:
+def _scanner_app(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
     """Read ARKit's camera to world, with axes right, up, back as ours, and the camera's matrix."""
     said = mapping(read_json(path))
     pose = numbers(said.get("cameraPoseARFrame"), 16, f"{path}: cameraPoseARFrame")
@@ -115,59 +117,27 @@ LAYOUTS = (
 )
 
 
-@dataclass
-class PoseFilesReader(PosedReader):
-    """Read one of `LAYOUTS`.
+def _read(layout: Layout, reader: PosedReader, first: Path) -> Capture:
+    """Return the photographs in order of their poses' names."""
+    root = reader.folder()
+    if not layout.depth:
+        log.info("%s: depth maps are not read", root)
+    pictures = next((each for each in layout.pictures if pictures_below((root / each).parent)), layout.pictures[0])
+    before, _, behind = layout.poses.rpartition("/")[2].partition("*")
+    paths = sorted(path for path in root.glob(layout.poses) if not path.name.startswith("."))
+    names = {path: pictures.format(path.name.removeprefix(before).removesuffix(behind)) for path in paths}
+    if layout.more_poses:
+        there = pictures_by_stem((root / pictures).parent)
+        paths = [path for path in paths if Path(names[path]).name in there]
 
-    Args:
-        intrinsics: fx, fy, cx, cy in pixels of the pictures, of layouts that have none (7-Scenes).
-    """
+    def posed(path: Path, _: str) -> Posed:
+        depth = path.with_name(layout.depth.format(path.stem.removeprefix(before))) if layout.depth else None
+        return Posed(names[path], str(path), lambda size: layout.camera(reader, path, size), depth)
 
-    program = "ScanNet, 7-Scenes, MVSNet or 3D Scanner App"
-    signatures = tuple(layout.signature for layout in LAYOUTS)
-    named_by = ()
-    one_each = True
-
-    name: str = "pose_files"
-    intrinsics: list[float] | None = None
-
-    @classmethod
-    def program_of(cls, path: Path) -> str:
-        """Return who has written a file."""
-        return _layout_of(path).program
-
-    def capture(self) -> Capture:
-        """Return the photographs in order of their poses' names."""
-        root, layout = self.folder(), _layout_of(self.source())
-        if not layout.depth:
-            log.info("%s: depth maps are not read", root)
-        pictures = next((each for each in layout.pictures if pictures_below((root / each).parent)), layout.pictures[0])
-        folder = (root / pictures).parent
-        before, _, behind = layout.poses.rpartition("/")[2].partition("*")
-        paths = sorted(path for path in root.glob(layout.poses) if not path.name.startswith("."))
-        names = {path: pictures.format(path.name.removeprefix(before).removesuffix(behind)) for path in paths}
-        if layout.more_poses:
-            there = pictures_by_stem(folder)
-            paths = [path for path in paths if Path(names[path]).name in there]
-
-        def posed(path: Path, _: str) -> Posed:
-            depth = path.with_name(layout.depth.format(path.stem.removeprefix(before))) if layout.depth else None
-            return Posed(names[path], str(path), lambda size: layout.camera(self, path, size), depth)
-
-        items = {path.relative_to(root).as_posix(): path for path in paths}
-        return self.posed(root / Path(layout.poses).parent, items, posed, root)
-
-    def given(self, program: str, size: Size) -> Intrinsics:
-        """Return the intrinsics that the user has given."""
-        if self.intrinsics is None or len(self.intrinsics) != 4:
-            raise InputError(
-                f"{self.root}: {program} has poses without focal lengths. Give fx, fy, cx and cy in pixels of the "
-                "pictures: scene=pose_files 'scene.intrinsics=[525,525,320,240]'."
-            )
-        fx, fy, cx, cy = map(float, self.intrinsics)
-        return Intrinsics((fx, fy), (cx, cy), size)
+    items = {path.relative_to(root).as_posix(): path for path in paths}
+    return reader.posed(root / Path(layout.poses).parent, items, posed, root)
 
 
-def _layout_of(path: Path) -> Layout:
-    """Return the layout of a file that has the signature of one."""
-    return next(each for each in LAYOUTS if fits(path, each.signature))
+FORMATS = tuple(
+    Format(layout.program, (layout.signature,), partial(_read, layout), one_each=True) for layout in LAYOUTS
+)

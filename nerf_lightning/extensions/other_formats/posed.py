@@ -3,11 +3,10 @@
 import logging
 import math
 import os
-from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -21,9 +20,10 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.signatures import Signature, file_with, files_with, fits
+from nerf_lightning.files.signatures import Signature
+from nerf_lightning.files.trust import shown
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed, require_printable
+from nerf_lightning.messages.escaping import require_printable
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
 from nerf_lightning.nerf.types.scene import LensModel
@@ -64,47 +64,21 @@ class Posed:
     depth: Path | None = None
 
 
+FOLDERS = (*(name for name in PICTURE_FOLDERS if name), "color", "frames", "results")
+"""Of pictures, the likeliest first."""
+
+
 @dataclass
 class PosedReader(CaptureReader):
-    """Read pictures with a camera each; a subclass says by which file it knows a capture, and what that holds."""
+    """Read pictures with a camera each, as a format lists them.
 
-    program: ClassVar[str]
-    """Who writes this format, for messages."""
-    signatures: ClassVar[tuple[Signature, ...]]
-    """Of the file that lists the cameras, the likeliest first."""
-    one_each: ClassVar[bool] = False
-    """Whether such a file is of one picture."""
-    named_by: ClassVar[tuple[str, ...]] = (".json",)
+    Args:
+        images: the folder of the pictures below root; null: the format's own.
+        intrinsics: fx, fy, cx, cy in pixels of the pictures, of formats that have none.
+    """
 
-    @classmethod
-    def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it, or is that file itself."""
-        if folder.is_file():
-            return folder.name if any(fits(folder, signature) for signature in cls.signatures) else None
-        return next((file for signature in cls.signatures if (file := file_with(folder, signature))), None)
-
-    @abstractmethod
-    def capture(self) -> Capture:
-        """Return all pictures, in the file's order."""
-
-    def source(self) -> Path:
-        """Return the file that the user has named, or the one by which the capture is known."""
-        path, folder = Path(self.root).expanduser(), self.folder()
-        if not os.path.isfile(path):
-            found = next((files for each in self.signatures if (files := list(files_with(folder, each)))), None)
-            if found is None:
-                patterns = listed(dict.fromkeys(pattern for pattern, _ in self.signatures), 9)
-                raise InputError(f"{folder} holds no file of {self.program} ({patterns}). Give the folder that does.")
-            path = folder / found[0]
-            if found[1:] and not self.one_each:
-                log.warning("%s is read, and not %s: scene.root=FILE reads another", path, listed(found[1:], 3))
-        log.info("%s: cameras of %s", path, self.program_of(path))
-        return path
-
-    @classmethod
-    def program_of(cls, path: Path) -> str:
-        """Return who has written a file."""
-        return cls.program
+    images: str | None = None
+    intrinsics: list[float] | None = None
 
     def posed(
         self,
@@ -127,7 +101,9 @@ class PosedReader(CaptureReader):
         """
         require_within("views", len(items), source, "views")
         root = root or self.folder()
-        folder = folder or first_with_pictures(root, [name for name in PICTURE_FOLDERS if name]) or root
+        if self.images is not None:
+            folder = root = self.folder() / self.images
+        folder = folder or first_with_pictures(root, FOLDERS) or root
         left_out, named = LeftOut(str(source)), list[Posed]()
         for place, item in items.items():
             with left_out.unless_usable(place):
@@ -161,10 +137,40 @@ class PosedReader(CaptureReader):
         left_out.require_enough(len(views))
         return Capture(tuple(views), source, one_lens_model(kinds or {"pinhole"}, source), left_out=left_out, **more)
 
+    def given(self, program: str, size: Size = (1.0, 1.0)) -> Intrinsics:
+        """Return the intrinsics that the user has given, for a picture of (width, height) pixels."""
+        if self.intrinsics is None or len(self.intrinsics) != 4:
+            raise InputError(
+                f"{self.root}: {program} has poses without focal lengths. Give fx, fy, cx and cy in pixels of the "
+                "pictures: scene=other_program 'scene.intrinsics=[525,525,319.5,239.5]'."
+            )
+        fx, fy, cx, cy = map(float, self.intrinsics)
+        return Intrinsics((fx, fy), (cx, cy), size)
+
+    def pictures(self, likeliest: str = "images") -> Path:
+        """Return the folder of the pictures."""
+        root = self.folder()
+        return first_with_pictures(root, [self.images] if self.images else [likeliest, *FOLDERS]) or root
+
     def _absent(self, picture: Posed, root: Path) -> str:
         elsewhere = os.path.isabs(picture.name) and os.path.isfile(picture.name)
         cure = ", or add scene.allow_outside=true to read it where it is" if elsewhere else ""
         return f"{picture.where}: no picture below {root} is called {picture.name}. Copy it there{cure}."
+
+
+@dataclass(frozen=True)
+class Format:
+    """How the captures of a program are known and read."""
+
+    program: str
+    signatures: tuple[Signature, ...]
+    """Of the file that lists the cameras, the likeliest first."""
+    read: Callable[[PosedReader, Path], Capture]
+    """Returns what such a file lists, in its order."""
+    suits: Callable[[Path], bool] = Path.exists
+    """Whether a folder with such a file is such a capture."""
+    one_each: bool = False
+    """Whether such a file is of one picture."""
 
 
 def from_opencv(matrix: object, where: str) -> Pose:
@@ -200,7 +206,10 @@ def numbers(value: object, count: int, where: str) -> list[float]:
             return [float(each) for each in found]
     except (TypeError, ValueError, OverflowError):
         pass
-    wanted, is_ = "a number" if count == 1 else f"{count} numbers", "missing" if value is None else str(value)[:80]
+    wanted, is_ = (
+        "a number" if count == 1 else f"{count} numbers",
+        "missing" if value is None else shown(" ".join(map(str, found))),
+    )
     raise InputError(f"{where} must be {wanted}, but it is {is_}. {CURE}")
 
 

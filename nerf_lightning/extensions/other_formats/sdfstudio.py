@@ -1,14 +1,15 @@
 """sdfstudio's `meta_data.json`: a matrix and intrinsics for each frame."""
 
 import logging
-from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import torch
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.readers.frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -31,27 +32,17 @@ NOT_READ = ("mono_depth_path", "mono_normal_path", "sensor_depth_path", "foregro
 log = logging.getLogger(__name__)
 
 
-@dataclass
-class SdfStudioReader(PosedReader):
+def _read(reader: PosedReader, path: Path) -> Capture:
     """Read sdfstudio's frames. `worldtogt` takes their frame to the one that the capture's maker knows."""
-
-    program = "sdfstudio"
-    signatures = (("meta_data.json", '"(camtoworld|worldtogt|has_mono_prior|rgb_path)"'),)
-
-    name: str = "sdfstudio"
-
-    def capture(self) -> Capture:
-        """Return all frames, in the file's order."""
-        path = self.source()
-        content = read_json(path)
-        frames = entries(content, "frames", f"{path} of sdfstudio")
-        beside = sorted({key for frame in frames if isinstance(frame, dict) for key in NOT_READ if frame.get(key)})
-        if beside:
-            log.warning("%s: %s of the frames are not read", path, listed(beside))
-        undo = similarity(content.get("worldtogt", torch.eye(4).tolist()), f"{path}: worldtogt")
-        whole = [number(content, side, str(path), 0) for side in ("width", "height")]
-        size = (whole[0], whole[1]) if min(whole) > 0 else None
-        return self.posed(path, numbered("frames", frames), partial(_posed, size), path.parent, undo=undo)
+    content = read_json(path)
+    frames = entries(content, "frames", f"{path} of sdfstudio")
+    beside = sorted({key for frame in frames if isinstance(frame, dict) for key in NOT_READ if frame.get(key)})
+    if beside:
+        log.warning("%s: %s of the frames are not read", path, listed(beside))
+    undo = similarity(content.get("worldtogt", torch.eye(4).tolist()), f"{path}: worldtogt")
+    whole = [number(content, side, str(path), 0) for side in ("width", "height")]
+    size = (whole[0], whole[1]) if min(whole) > 0 else None
+    return reader.posed(path, numbered("frames", frames), partial(_posed, size), path.parent, undo=undo)
 
 
 def _posed(size: Size | None, frame: object, where: str) -> Posed:
@@ -66,3 +57,6 @@ def _posed(size: Size | None, frame: object, where: str) -> Posed:
         return from_opencv(matrix, f"{where}: camtoworld"), Intrinsics(focal, center, size or picture)
 
     return Posed(path_of(name, "rgb_path", where), where, camera)
+
+
+FORMAT = Format("sdfstudio", (("meta_data.json", '"(camtoworld|worldtogt|has_mono_prior|rgb_path)"'),), _read)

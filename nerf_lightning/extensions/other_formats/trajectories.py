@@ -1,19 +1,19 @@
 """Captures with all poses in one text file: TUM, Replica, Tanks and Temples, RealEstate10K, Stray Scanner.
 
-Each has a function that reads its lines, and a row in `FORMATS`.
+Each has a function that reads its lines, and a row in `FORMATS`. Poses are camera to world with axes right, down,
+ahead, but for RealEstate10K's.
 """
 
 import logging
 from bisect import bisect_left
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order, pictures_below
+from nerf_lightning.data.captures.pictures import numeric_order, pictures_below
 from nerf_lightning.extensions.other_formats.posed import (
+    Format,
     Intrinsics,
     Pose,
     Posed,
@@ -26,7 +26,6 @@ from nerf_lightning.extensions.other_formats.posed import (
 )
 from nerf_lightning.files.json_files import mapping, read_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.files.signatures import Signature, fits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
@@ -37,23 +36,12 @@ LINE_OF = rf"[ \t]*{NUMBER}(?:[ \t]+{NUMBER}){{%d}}[ \t]*\r?(?:\n|\Z)"
 """A regular expression of a line of one number and %d more."""
 NEAR_IN_TIME = 0.02
 """Seconds between a picture and its pose at most, as TUM's own tool has it."""
-FOLDERS = (*(name for name in PICTURE_FOLDERS if name), "color", "frames", "results")
-
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Format:
-    """A kind of text file with poses."""
-
-    program: str
-    signature: Signature
-    read: Callable[["TrajectoryReader", Path], Capture]
-
-
-def _tum(reader: "TrajectoryReader", path: Path) -> Capture:
+def _tum(reader: PosedReader, path: Path) -> Capture:
     """Read time, position and quaternion x y z w per line, for the pictures of rgb.txt (time, name)."""
-    reader.given("TUM", (1.0, 1.0))
+    reader.given("TUM")
     poses = sorted((row[0], row) for words in _lines(path).values() if len(row := _floats(words)) == 8)
     times = [time for time, _ in poses]
 
@@ -75,7 +63,7 @@ def _tum(reader: "TrajectoryReader", path: Path) -> Capture:
     return reader.posed(pictures, _lines(pictures), posed, path.parent)
 
 
-def _replica(reader: "TrajectoryReader", path: Path) -> Capture:
+def _replica(reader: PosedReader, path: Path) -> Capture:
     """Read a matrix per line; the number in a picture's name is that of its line, from 0."""
     params = next((file for folder in path.parents[:2] if (file := folder / "cam_params.json").is_file()), None)
     said = None if params is None else mapping(mapping(read_json(params)).get("camera"))
@@ -104,10 +92,10 @@ def _replica(reader: "TrajectoryReader", path: Path) -> Capture:
     return reader.posed(path, pictures, posed, folder, depth_unit=1.0 / scale)
 
 
-def _tanks(reader: "TrajectoryReader", path: Path) -> Capture:
+def _tanks(reader: PosedReader, path: Path) -> Capture:
     """Read blocks of three numbers and a matrix, of the pictures in order."""
-    lines, names = list(_lines(path).values()), reader.in_order()
-    reader.given("Tanks and Temples", (1.0, 1.0))
+    lines, names = list(_lines(path).values()), _in_order(reader.pictures())
+    reader.given("Tanks and Temples")
     if len(lines) != 5 * len(names):
         raise InputError(
             f"{path} of Tanks and Temples has {len(lines) / 5:g} poses, but {reader.pictures()} has {len(names)} "
@@ -128,7 +116,7 @@ def _tanks(reader: "TrajectoryReader", path: Path) -> Capture:
     return reader.posed(path, {f"pose {index}": index for index in range(len(names))}, posed, reader.pictures())
 
 
-def _real_estate(reader: "TrajectoryReader", path: Path) -> Capture:
+def _real_estate(reader: PosedReader, path: Path) -> Capture:
     """Read time, fx, fy, cx, cy as shares of width and height, two zeros, and a world to camera matrix per line."""
 
     def posed(words: list[str], where: str) -> Posed:
@@ -146,7 +134,7 @@ def _real_estate(reader: "TrajectoryReader", path: Path) -> Capture:
     return reader.posed(path, lines, posed, reader.pictures(path.stem))
 
 
-def _stray(reader: "TrajectoryReader", path: Path) -> Capture:
+def _stray(reader: PosedReader, path: Path) -> Capture:
     """Read a csv of frames with position, quaternion and, in later versions, intrinsics; depths are millimeters."""
     root, folder = path.parent, reader.pictures()
     if not pictures_below(folder) or folder == root:
@@ -198,70 +186,22 @@ def _floats(words: list[str]) -> list[float]:
         return []
 
 
+def _in_order(folder: Path) -> list[str]:
+    """Return the pictures in order of their names, below their folder."""
+    names = [path.relative_to(folder).as_posix() for path in pictures_below(folder)]
+    if numeric_order(names) != names:
+        raise InputError(
+            f"{folder}: the order of the pictures as text ({listed(names, 3)}) is not that of their numbers, and "
+            "poses belong to them in order. Call them 001, 002, ..."
+        )
+    return names
+
+
 FORMATS = (
-    Format("Stray Scanner", ("odometry.csv", r"\A\s*timestamp\s*,\s*frame\b"), _stray),
-    Format("Replica", ("traj.txt", r"\A" + LINE_OF % 15), _replica),
-    Format("Replica (Semantic-NeRF)", ("traj_w_c.txt", r"\A" + LINE_OF % 15), _replica),
-    Format("TUM", ("groundtruth.txt", r"(?m)^" + LINE_OF % 7), _tum),
-    Format("Tanks and Temples", ("*.log", r"\A" + LINE_OF % 2 + f"(?:{LINE_OF % 3}){{4}}"), _tanks),
-    Format("RealEstate10K", ("*.txt", r"\A\s*https?://\S+\s*\n" + LINE_OF % 18), _real_estate),
+    Format("Stray Scanner", (("odometry.csv", r"\A\s*timestamp\s*,\s*frame\b"),), _stray),
+    Format("Replica", (("traj.txt", r"\A" + LINE_OF % 15),), _replica),
+    Format("Replica (Semantic-NeRF)", (("traj_w_c.txt", r"\A" + LINE_OF % 15),), _replica),
+    Format("TUM", (("groundtruth.txt", r"(?m)^" + LINE_OF % 7),), _tum),
+    Format("Tanks and Temples", (("*.log", r"\A" + LINE_OF % 2 + f"(?:{LINE_OF % 3}){{4}}"),), _tanks),
+    Format("RealEstate10K", (("*.txt", r"\A\s*https?://\S+\s*\n" + LINE_OF % 18),), _real_estate),
 )
-
-
-@dataclass
-class TrajectoryReader(PosedReader):
-    """Read poses of one text file; all but RealEstate10K's are camera to world, and axes are right, down, ahead.
-
-    Args:
-        intrinsics: fx, fy, cx, cy in pixels of the pictures, of formats that have none (TUM, Tanks and Temples).
-    """
-
-    program = "TUM, Replica, Tanks and Temples, RealEstate10K or Stray Scanner"
-    signatures = tuple(each.signature for each in FORMATS)
-    named_by = (".log",)
-
-    name: str = "trajectory"
-    intrinsics: list[float] | None = None
-
-    @classmethod
-    def program_of(cls, path: Path) -> str:
-        """Return who has written a file."""
-        return _format_of(path).program
-
-    def capture(self) -> Capture:
-        """Return all pictures, in the file's order."""
-        path = self.source()
-        return _format_of(path).read(self, path)
-
-    def given(self, program: str, size: Size) -> Intrinsics:
-        """Return the intrinsics that the user has given."""
-        if self.intrinsics is None or len(self.intrinsics) != 4:
-            raise InputError(
-                f"{self.root}: {program} has poses without focal lengths. Give fx, fy, cx and cy in pixels of the "
-                f"pictures: scene=trajectory 'scene.intrinsics=[525,525,319.5,239.5]'."
-            )
-        fx, fy, cx, cy = map(float, self.intrinsics)
-        return Intrinsics((fx, fy), (cx, cy), size)
-
-    def pictures(self, likeliest: str = "images") -> Path:
-        """Return the folder of the pictures."""
-        root = self.folder()
-        return first_with_pictures(root, [likeliest, *FOLDERS]) or root
-
-    def in_order(self) -> list[str]:
-        """Return the pictures in order of their names, below their folder."""
-        folder = self.pictures()
-        names = [path.relative_to(folder).as_posix() for path in pictures_below(folder)]
-        if numeric_order(names) != names:
-            raise InputError(
-                f"{folder}: the order of the pictures as text ({listed(names, 3)}) is not that of their numbers, and "
-                "poses belong to them in order. Call them 001, 002, ..."
-            )
-        return names
-
-
-def _format_of(path: Path) -> Format:
-    found = next((each for each in FORMATS if fits(path, each.signature)), None)
-    if found is None:
-        raise InputError(f"{path} is no file with poses of {TrajectoryReader.program}. Give another one.")
-    return found

@@ -56,7 +56,7 @@ HINTS = {
     "A .r3d file of Record3D": {"a.r3d": ""},
     "RealityScan's": {"cameras.csv": "#name,x,y,alt,heading,pitch,roll,f"},
     "XMP files": {"0.xmp": ""},
-    "output of 3DGS": {"cfg_args": "Namespace(source_path='/a')"},
+    "output of 3DGS": {"point_cloud/iteration_7/point_cloud.ply": ""},
     "OpenSfM or ODM": {"cameras.json": '{"a": {"projection_type": "brown"}}'},
     "project of Meshroom": {"a.mg": ""},
     "VisualSFM": {"a.nvm": "NVM_V3 "},
@@ -73,7 +73,7 @@ HINTS = {
 @pytest.mark.parametrize("words", HINTS)
 def test_captures_of_other_programs_are_named_by_what_their_files_hold(tmp_path, words):
     for name, text in HINTS[words].items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=words):
         AutoReader(root=str(tmp_path)).read()

@@ -40,8 +40,7 @@ from posed_writers import (
 from support.plain_capture import everything_is_said, read, said_once  # noqa: F401
 
 from nerf_lightning.data.readers.auto import AutoReader
-from nerf_lightning.extensions.other_formats.pose_files import PoseFilesReader
-from nerf_lightning.extensions.other_formats.trajectories import TrajectoryReader
+from nerf_lightning.extensions.other_formats.other_program import OtherProgramReader
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import is_rigid
 
@@ -155,25 +154,25 @@ def at(write, **more):
 
 
 @pytest.mark.parametrize(
-    ("reader", "write", "program"),
+    ("write", "program"),
     [
-        (TrajectoryReader, write_tum, "TUM"),
-        (TrajectoryReader, write_tanks, "Tanks and Temples"),
-        (PoseFilesReader, at(write_seven_scenes, info=False), "7-Scenes"),
+        (write_tum, "TUM"),
+        (write_tanks, "Tanks and Temples"),
+        (at(write_seven_scenes, info=False), "7-Scenes"),
     ],
 )
-def test_intrinsics_that_a_format_lacks_are_asked_for_and_taken(tmp_path, reader, write, program):
+def test_intrinsics_that_a_format_lacks_are_asked_for_and_taken(tmp_path, write, program):
     write(tmp_path / "c", KNOWN)
     with pytest.raises(InputError, match=rf"{program} has poses without focal lengths. Give fx, fy, cx and cy"):
         read(tmp_path / "c")
-    assert_known(reader(root=str(tmp_path / "c"), intrinsics=GIVEN).capture(), KNOWN)
+    assert_known(OtherProgramReader(root=str(tmp_path / "c"), intrinsics=GIVEN).capture(), KNOWN)
 
 
 def test_tums_pictures_without_a_pose_near_in_time_are_left_out(tmp_path):
     write_tum(tmp_path, KNOWN)
     lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
     text(tmp_path / "groundtruth.txt", [line for line in lines if not line.startswith("1305031105.01")])
-    left_out = TrajectoryReader(root=str(tmp_path), intrinsics=GIVEN).capture().left_out
+    left_out = OtherProgramReader(root=str(tmp_path), intrinsics=GIVEN).capture().left_out
     assert list(left_out.faults) == ["rgb/3.png"]
     assert "no pose within 0.02 s" in left_out.faults["rgb/3.png"]
 
@@ -182,7 +181,7 @@ def test_poses_are_not_paired_with_another_number_of_pictures(tmp_path):
     write_tanks(tmp_path, KNOWN)
     (tmp_path / "images" / "000004.png").unlink()
     with pytest.raises(InputError, match=r"has 9 poses, but .* has 8 pictures"):
-        TrajectoryReader(root=str(tmp_path), intrinsics=GIVEN).capture()
+        OtherProgramReader(root=str(tmp_path), intrinsics=GIVEN).capture()
 
 
 def test_depths_of_replica_and_phones_are_read_in_their_units(tmp_path):
@@ -381,3 +380,13 @@ def test_points_that_are_broken_are_left_out(tmp_path, caplog):
     dump(tmp_path / "reconstruction.json", [whole])
     assert len(AutoReader(root=str(tmp_path)).capture().points) == 0
     said_once(caplog, "its points are left out")
+
+
+def test_renderings_in_the_output_of_3dgs_are_no_photographs(tmp_path):
+    write_splat_cameras(tmp_path, MIDDLE)
+    (tmp_path / "point_cloud").mkdir()
+    assert_known(AutoReader(root=str(tmp_path)).capture(), MIDDLE)
+    (tmp_path / "images").rename(tmp_path / "renders")
+    for root in (tmp_path, tmp_path / "cameras.json"):
+        with pytest.raises(InputError, match=r"output of .* source_path"):
+            read(root)
