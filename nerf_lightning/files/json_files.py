@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.regular import read_text
+from nerf_lightning.files.regular import other_format, read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
@@ -16,7 +16,12 @@ CURE = "Export it again, or fix it with a JSON checker."
 
 def read_json(path: Path) -> Any:
     """Return the content of a json file."""
-    return parse_json(read_text(path, "json", CURE), path)
+    try:
+        return parse_json(read_text(path, "json", CURE), path)
+    except InputError as error:
+        if (other := other_format(path)) is None:
+            raise
+        raise InputError(f"{path} is {other}.") from error
 
 
 def parse_json(text: str, where: Path) -> Any:

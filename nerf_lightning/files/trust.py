@@ -18,6 +18,7 @@ import torch
 from jaxtyping import AbstractArray
 from torch import Tensor
 
+from nerf_lightning.files.regular import other_format
 from nerf_lightning.messages.errors import InputError
 
 LARGEST_COUNT = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
@@ -41,6 +42,8 @@ def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
     except Mismatch as problem:
         raise InputError(f"{path} is damaged, or was made by somebody else: {problem}. {cure}") from problem
     except Exception as error:
+        if (other := other_format(Path(path))) is not None:
+            raise InputError(f"{path} is {other}.") from error
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path} cannot be read ({type(error).__name__}: {reason}). {cure}") from error
 

@@ -30,7 +30,11 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
         "pixels.path.with_name(hashlib.sha256(parts.encode()).hexdigest()[:24])",
         *("root / f'{stem}_{split}.json'", "folder / f'{name}{ending}'", "folder / f'cameras{ending}'"),
         *("path / f'cameras{e}'", "folder / f'images{ending}'", "work / f'{attempt.database}_{attempt.mapper}'"),
-        "folder / f'frame_{number:06d}.jpg'",
+        *(
+            "folder / f'{other}{ending}'",
+            "folder / f'frame_{number:06d}.jpg'",
+            "picture.with_name(f'dynamic_mask_{picture.name}')",
+        ),
     },
     "evaluation": {
         "folder / f'{part}.png'",

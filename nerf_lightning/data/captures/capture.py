@@ -31,7 +31,9 @@ class View:
     lens: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, k3, k4, p1, p2."""
     depth: Path | None = None
-    """A gray picture of 16 bits whose levels are depths along the camera's axis; 0 is unknown."""
+    """A gray picture of 16 bits, or an array of numpy's (.npy), of depths along the camera's axis; 0 is unknown."""
+    depth_unit: float | None = None
+    """How long a unit of `depth` is, in units of the capture; None: as of all (`Capture.depth_unit`)."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 have not lost every digit that a picture could show."""
 LEAST_SCALE, ALMOST_ONE = 1e-6, 4e-4
 """Of a rotation's scale: less is none, and so near to 1 it is rounding."""
+ROUNDED = 1e-4
+"""Of rotations, and of how far cameras stand from their middle: poses that differ less are one pose."""
 SMALL = 16
 """Pixels of a side, up to which a principal point may be as near to the corner as 1."""
 WIDEST = 170.0
@@ -52,6 +54,8 @@ def usable(capture: Capture) -> Capture:
             " stay",
             *(capture.source, len(scaled), len(views), scaled[0]),
         )
+    centers = torch.stack([view.c2w[:, 3] for view in views]) if views else torch.zeros(1, 3)
+    reach = float((centers - centers.nanmedian(dim=0).values).norm(dim=-1).nanmedian())
     first: dict[str, int] = {}
     same: dict[int, int] = {}
     kept = []
@@ -64,7 +68,7 @@ def usable(capture: Capture) -> Capture:
             if view.name not in first:
                 first[view.name] = number
                 kept.append(number)
-            elif torch.allclose(view.c2w, views[first[view.name]].c2w):
+            elif _almost_alike(view.c2w, views[first[view.name]].c2w, reach):
                 same[number] = first[view.name]
             else:  # files and tables are written by name
                 kept = [other for other in kept if other != first[view.name]]
@@ -75,6 +79,12 @@ def usable(capture: Capture) -> Capture:
         for split, numbers in capture.splits.items()
     }
     return _with_known_depths(replace(capture, views=views, splits=splits).some(kept))
+
+
+def _almost_alike(one: Float[Tensor, "3 4"], other: Float[Tensor, "3 4"], reach: float) -> bool:
+    """Return whether two poses differ by rounding alone; `reach` is how far cameras stand from their middle."""
+    off = (one - other).abs()
+    return float(off[:, :3].max()) <= ROUNDED and float(off[:, 3].max()) <= ROUNDED * reach
 
 
 def _without_scale(view: View) -> tuple[View, float | None]:

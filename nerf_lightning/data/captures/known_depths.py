@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -47,17 +46,18 @@ def known_depths(capture: Capture, cameras: Cameras) -> KnownDepths | None:
     if len(capture.tracks):
         found.append(depths_of_points(capture.points, capture.point_errors, capture.tracks, cameras))
     if any(view.depth is not None for view in capture.views):
-        found.append(depths_of_maps([view.depth for view in capture.views], capture.depth_unit, cameras))
+        units = [view.depth_unit or capture.depth_unit for view in capture.views]
+        found.append(depths_of_maps([view.depth for view in capture.views], units, cameras))
     every = concatenate(found) if found else None
     return every if every is not None and len(every) else None
 
 
-def depths_of_maps(maps: Sequence[Path | None], unit: float, cameras: Cameras) -> KnownDepths:
+def depths_of_maps(maps: Sequence[Path | None], units: Sequence[float], cameras: Cameras) -> KnownDepths:
     """Return distances that depth sensors measured; maps that cannot be used are left out and named.
 
     Args:
         maps: one per view, of any size of the photograph's shape; None: there is none.
-        unit: length of a level, in the units of the cameras.
+        units: of each, the length of a level or of 1, in the units of the cameras.
         cameras: at the size of the pixels.
     """
     found, odd = [KnownDepths(PixelIndex(*(torch.zeros(0, dtype=torch.int64),) * 3), *(torch.zeros(0),) * 2)], []
@@ -66,7 +66,7 @@ def depths_of_maps(maps: Sequence[Path | None], unit: float, cameras: Cameras) -
         if path is None:
             continue
         try:
-            depth = torch.from_numpy(read_depth(path).astype(np.float32))
+            depth = torch.from_numpy(read_depth(path))
         except InputError as error:
             odd.append(str(error).split(". ")[0])
             continue
@@ -80,7 +80,7 @@ def depths_of_maps(maps: Sequence[Path | None], unit: float, cameras: Cameras) -
         pixels = PixelIndex(torch.full_like(x, view), column.long(), row.long())
         directions = rays_through_pixels(turned, pixels, zeros, zeros).directions
         ahead = -(directions @ cameras.c2w[view, :, 2].to(directions)).clamp(max=-1e-3)
-        distance = (unit * depth[y, x] / ahead).float()
+        distance = (units[view] * depth[y, x] / ahead).float()
         found.append(KnownDepths(pixels, distance, torch.full_like(distance, OF_A_SENSOR)))
     if odd:
         log.warning("%d depth maps are left out: %s", len(odd), listed(odd, 3))

@@ -5,6 +5,7 @@ ending than what is there. All names of a file are changed in the same way: so m
 beginning, and the rest lies in one folder of the capture.
 """
 
+import glob
 import logging
 import os
 import re
@@ -32,6 +33,7 @@ BESIDE_PHOTOGRAPHS = re.compile(r"(masks?|depths?|normals?|segmentations?|semant
 MASK_ENDING = re.compile(r"[._-]masks?$")
 """What a mask's name may have and its photograph's has not."""
 DRIVE = re.compile(r"^[a-zA-Z]:")
+ZEROS = re.compile(r"(?<![0-9])0+(?=[0-9])")
 NUMBERS = re.compile(r"(\D*)(\d*)", re.ASCII)
 
 log = logging.getLogger(__name__)
@@ -77,7 +79,10 @@ def find_pictures(
     if len(exact) == len(names):
         return exact
     others = [name for name in names if name not in exact]
-    rules = _rules(others, root, folder, beside, taken={*exact.values(), *(beside or ())})
+    taken = {*exact.values(), *(beside or ())}
+    rules = _rules(others, root, folder, beside, taken)
+    if not rules and beside is not None:
+        rules = _rules(others, root, folder, beside, taken, by_number=True)
     if exact:
         # Names are right as they are, and some files are missing; but their case or ending may differ, or the machine.
         rules = {
@@ -164,6 +169,35 @@ def named_picture(
     return next((path for path in allowed if path not in taken and os.path.isfile(path)), None)
 
 
+def why_absent(name: str, folder: Path, root: Path) -> str:
+    """Return why no file is found by the name of a picture, and what to do.
+
+    Args:
+        name: as the capture has it.
+        folder: what it is relative to.
+        root: the capture's folder.
+    """
+    if named_picture(folder, name):
+        return (
+            f"{name} leads out of the capture's folder {root} and is not followed, for safety. If this capture is "
+            "yours, add scene.allow_outside=true; otherwise copy the picture into the folder."
+        )
+    if is_absolute(name):
+        return (
+            f"{name} is an absolute path of another machine, and no picture below {root} matches its end. Copy the "
+            "pictures there, or set scene.images to their folder (scene=colmap)."
+        )
+    named = folder / name.replace("\\", "/")
+    for path in sorted(named.parent.glob(f"{glob.escape(named.stem)}.*")) if named.name else ():
+        cure = UNREAD.get(path.suffix.lower(), "Pictures of this format are not read: convert all of them to PNG.")
+        if path.suffix.lower() not in ENDINGS:
+            return f"the image {named} does not exist, but {path.name} does. {cure}"
+    return (
+        f"the image {named} does not exist, and neither does one with another extension. Copy it there, or remove it "
+        "from the capture's list."
+    )
+
+
 def is_absolute(name: str) -> bool:
     r"""Return whether a name begins at a root, of Windows too.
 
@@ -178,24 +212,32 @@ def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in PurePosixPath(plain).parts if part not in (".", ".."))
 
 
-def _plain(parts: tuple[str, ...]) -> tuple[str, ...]:
-    """Return parts of a path as they are compared: without ending and case, %20 or a space, and one form of letters."""
+def _plain(parts: tuple[str, ...], by_number: bool = False) -> tuple[str, ...]:
+    """Return parts of a path as they are compared: without ending and case, %20 or a space, and one form of letters.
+
+    `by_number` compares numbers, too, whatever zeros they begin with.
+    """
     *folders, last = (unicodedata.normalize("NFC", unquote(part)).casefold() for part in parts)
     while (stem := Path(last)).suffix in KNOWN_ENDINGS and stem.stem:  # masks are called 0001.jpg.png
         last = stem.stem
-    return (*folders, last)
+    return (*folders, ZEROS.sub("", last) if by_number else last)
 
 
 def _rules(
-    names: Sequence[str], root: Path, folder: Path, beside: Collection[Path] | None, taken: Collection[Path]
+    names: Sequence[str],
+    root: Path,
+    folder: Path,
+    beside: Collection[Path] | None,
+    taken: Collection[Path],
+    by_number: bool = False,
 ) -> dict[Rule, dict[str, Path]]:
     """Return the files that each rule finds, where it finds another for every name, and none that is taken."""
-    below = _by_plain_name(dict.fromkeys((root, folder)), beside is not None, taken)
+    below = _by_plain_name(dict.fromkeys((root, folder)), beside is not None, taken, by_number)
     fits: dict[Rule, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     for name in names:
         if not (parts := _parts(name)):
             continue
-        wanted = _plain(parts)
+        wanted = _plain(parts, by_number)
         for path, plain, folders in below[wanted[-1]]:
             if not _of_one_kind(set(wanted[:-1]), folders):
                 continue
@@ -209,7 +251,7 @@ def _rules(
 
 
 def _by_plain_name(
-    places: Iterable[Path], masks: bool, taken: Collection[Path]
+    places: Iterable[Path], masks: bool, taken: Collection[Path], by_number: bool
 ) -> dict[str, list[tuple[Path, tuple[str, ...], set[str]]]]:
     """Return the pictures below some folders, with their path as it is compared and the folders that they are in."""
     below = defaultdict(list)
@@ -217,7 +259,10 @@ def _by_plain_name(
         for path in pictures_below(place):
             if path in taken:
                 continue
-            plain, folders = _plain(path.parts), {part.lower() for part in path.relative_to(place).parts[:-1]}
+            plain, folders = (
+                _plain(path.parts, by_number),
+                {part.lower() for part in path.relative_to(place).parts[:-1]},
+            )
             if masks:
                 plain = (*plain[:-1], MASK_ENDING.sub("", plain[-1]))
             below[plain[-1]].append((path, plain, folders))

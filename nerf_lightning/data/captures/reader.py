@@ -15,7 +15,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
+from nerf_lightning.data.captures.masks import with_masks
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
@@ -23,7 +24,7 @@ from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscal
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.files.regular import contents, what_is
+from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
@@ -56,7 +57,8 @@ class CaptureReader(Reader):
         hold_every: the first and every k-th view after it are held out for evaluation, if the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
         masks: a folder below root with masks, named like their photographs (or with .png added, or instead of the
-            extension); photographs without a mask are used whole. null: no masks, or those that the format names.
+            extension); photographs without a mask are used whole. null: those that the format names, or else a folder
+            masks that has one for each photograph. none: no masks.
         masks_keep: the color of masks that is kept, white or black; the other is ignored.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content begins, in the capture's units; null: from the capture.
@@ -114,7 +116,7 @@ class CaptureReader(Reader):
             train, held = every_kth(range(len(capture.views)), self.hold_every)
             capture = replace(capture, splits={"train": train, "val": held, "test": held})
         capture = as_calibrated(usable(capture))
-        capture = self._with_masks(capture)
+        capture = with_masks(capture, self.masks, (self.top(), self.folder()), self.masks_keep)
         downscale = self._factor(capture)
         capture, pixels = self._decoded(capture, downscale)
         capture.left_out.say(len(capture.views))
@@ -162,6 +164,16 @@ class CaptureReader(Reader):
             log.info("%s contains no capture for scene=%s; reading %s instead", self.root, self.name, found[0])
         return found[0] if found else folder
 
+    def top(self) -> Path:
+        """Return the folder that may hold pictures: the capture's, or the one above it that the user named."""
+        named, folder = self.named_folder(), self.folder()
+        return named if folder.is_relative_to(named) else folder
+
+    def below(self, name: str) -> Path:
+        """Return what a setting names: below the folder that the user named, or below the capture's."""
+        paths = [self.top() / name, self.folder() / name]
+        return next(filter(os.path.lexists, paths), paths[-1])
+
     def named_folder(self) -> Path:
         """Return the folder that the user named, or the one of the file; `InputError` says that there is none."""
         try:
@@ -179,42 +191,14 @@ class CaptureReader(Reader):
             raise InputError(f"The folder {folder} {what_is(folder)}{where}. Set scene.root to the capture's folder.")
         return folder
 
-    def _with_masks(self, capture: Capture) -> Capture:
-        """Return the views with the masks of the folder `masks`; photographs that have none there are kept whole."""
-        masks: dict[str, Path] = {}
-        if self.masks is not None:
-            folder = self.folder() / self.masks
-            names = [view.name for view in capture.views]
-            photographs = {view.photograph.path for view in capture.views}
-            masks = find_pictures(names, folder, folder, capture.source, beside=photographs)
-            if not masks:
-                raise InputError(
-                    f"scene.masks={self.masks} holds no mask for any photograph of {capture.source}: {folder} "
-                    f"holds {contents(folder)}. A mask is named after its photograph ({names[0]}, with .png added, or "
-                    "with .png or _mask.png instead of its extension)."
-                )
-        views = tuple(
-            replace(view, photograph=replace(view.photograph, mask=masks.get(view.name, view.photograph.mask)))
-            for view in capture.views
-        )
-        whole = [view.name for view in views if view.photograph.mask is None]
-        if len(whole) == len(views) and self.masks_keep == "black":
-            raise InputError(
-                f"scene.masks_keep=black, but no photograph of {capture.source} has a mask. Name their folder with "
-                "scene.masks=FOLDER, or leave out masks_keep."
-            )
-        if whole and len(whole) < len(views):
-            log.warning(
-                "%d of %d photographs have no mask and are kept whole: %s", len(whole), len(views), listed(whole, 3)
-            )
-        return replace(capture, views=views)
-
     def _decoded(self, capture: Capture, downscale: int) -> tuple[Capture, PixelStore]:
         """Return the pixels, and the capture without the views whose photograph or mask cannot be decoded."""
         cache, label = Path(self.cache_dir) if self.cache_dir else None, f"Reading {Path(self.root).name}"
 
         def read(views: Sequence[View]) -> PixelStore:
-            photographs = [replace(view.photograph, mask_keeps=self.masks_keep) for view in views]
+            photographs = [
+                replace(view.photograph, mask_keeps=view.photograph.mask_keeps or self.masks_keep) for view in views
+            ]
             return read_photographs(photographs, downscale, cache, self.verify, label)
 
         return decoded(capture, read)

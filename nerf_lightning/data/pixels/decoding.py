@@ -44,6 +44,8 @@ TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 """What shows pixels by their EXIF orientation, of those that swap width and height."""
 THINNED = 1 << 28
 """Bytes that are hashed of pixels that are more than memory may hold (`CHECKED_WHOLE`): they come from the disk."""
+LEAST_RESIZED = 0.8
+"""What a resized picture's sides are at most, of the larger ones."""
 NOTICEABLE_BYTES = 1 << 31
 
 
@@ -53,8 +55,13 @@ class Photograph:
 
     path: Path
     mask: Path | None = None
-    """A gray picture of the same size, white (brighter than 127) and black."""
-    mask_keeps: MaskColor = "white"
+    """A gray picture of the same shape, white and black (`images.read_mask`)."""
+    mask_keeps: MaskColor | None = None
+    """None: what the user says, else white."""
+    radius: float | None = None
+    """Of the circle around the picture's middle that counts, in pixels as they are stored; None: all do."""
+    transparent: int | None = None
+    """The level of red, green and blue that means transparent, where the capture says so: 255 (white) or 0."""
     upright: bool = False
     """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
     header: PictureHeader | None = None
@@ -112,9 +119,9 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
     settings = {"format": FORMAT, "downscale": downscale, "files": files}
     if any(upright := [photograph.upright for photograph in photographs]):
         settings["upright"] = upright
-    kept = [photograph.mask_keeps for photograph in photographs]
-    if "black" in kept:
-        settings["masks_keep"] = kept
+    for name in ("mask_keeps", "radius", "transparent"):
+        if any(each := [getattr(photograph, name) for photograph in photographs]):
+            settings[name] = each
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -148,7 +155,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
     The threads write to the file and not through a mapping of it, so no picture stays in this process's memory.
     """
     sizes = _sizes(photographs, downscale, label)
-    masked = any(photograph.mask is not None for photograph in photographs)
+    masked = any(photograph.mask is not None or photograph.radius is not None for photograph in photographs)
     ends = np.cumsum([width * height for width, height in sizes])
     num_pixels = int(ends[-1])
     check_room(target.parent, num_pixels * (5 if masked else 4))
@@ -157,6 +164,8 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
     def decode(index: int) -> bool:
         photograph, size = photographs[index], sizes[index]
         rgba = read_rgba(photograph.path, photograph.upright)
+        if photograph.transparent is not None:
+            rgba[(rgba[..., :3] == photograph.transparent).all(axis=-1)] = 0
         rgba = area_downscale(crop_to_multiple(rgba, downscale), downscale)
         _check_unchanged(rgba, size, photograph.path)
         start = int(ends[index]) - rgba.shape[0] * rgba.shape[1]
@@ -179,38 +188,65 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
         path, mask = photographs[index].path, photographs[index].mask
         width, height = upright_size(photographs[index])
         sizes = ((width, height), (height, width)) if photographs[index].upright else ((width, height),)
-        if mask is not None and (of_mask := image_size(mask)) not in sizes:
-            across, down = of_mask
+        if mask is not None and not any(_of_one_shape(image_size(mask), size) for size in sizes):
+            across, down = image_size(mask)
             raise InputError(
-                f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}. "
-                "Give the mask the photograph's own size; it is shrunk together with it."
+                f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}, "
+                "which is another shape. Make the mask for this photograph, as large as it is or resized."
             )
         return downscaled_size(width, height, downscale)
 
     return each_or_faults(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
 
 
+def _of_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether two sizes are the same, or one is the other resized; nearly the same is cropped."""
+    (width, height), (across, down) = size, other
+    rounding = 0.5 * max(width + height, across + down)
+    resized = not LEAST_RESIZED < width / across < 1 / LEAST_RESIZED
+    return size == other or (resized and abs(width * down - height * across) <= rounding)
+
+
 def _mask(
     photograph: Photograph, size: tuple[int, int], downscale: int
 ) -> Bool[np.ndarray, "small_height small_width"]:
-    if photograph.mask is None:
-        return np.ones(size[::-1], dtype=np.bool_)
-    header = read_header(photograph.mask)
-    as_shown = photograph.upright and header.size != upright_size(photograph)
-    kept = read_mask(photograph.mask, photograph.mask_keeps, as_shown)
-    if as_shown and header.orientation == 1:  # programs that make masks may drop the tag
-        kept = TURNED[read_header(photograph.path).orientation](kept)
+    width, height = upright_size(photograph)
+    kept = np.ones((height, width), dtype=np.bool_)
+    if photograph.mask is not None:
+        kept = _mask_of(photograph, photograph.mask, (width, height))
+        if not _of_one_shape((kept.shape[1], kept.shape[0]), (width, height)):
+            _check_unchanged(kept, (width, height), photograph.mask)
+        kept = _resized(kept, (width, height))
+    if photograph.radius is not None:
+        y, x = (np.arange(side) + 0.5 - side / 2 for side in kept.shape)
+        kept = kept & (x * x + y[:, None] ** 2 <= photograph.radius**2)
     kept = whole_blocks(kept, downscale)
-    _check_unchanged(kept, size, photograph.mask)
+    _check_unchanged(kept, size, photograph.mask or photograph.path)
     if not kept.any():
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""
-        white = photograph.mask_keeps == "white"
         raise InputError(
-            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what "
-            f"is {'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Fix the "
-            f"mask, leave this view out, or invert all masks with scene.masks_keep={'black' if white else 'white'}."
+            f"The mask {photograph.mask or 'fisheye_crop_radius'} leaves no pixel of {photograph.path}{shrunk}: it "
+            f"keeps what is {photograph.mask_keeps or 'white'}. Fix the mask, or remove this view."
         )
     return kept
+
+
+def _mask_of(photograph: Photograph, mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Return a photograph's mask at its own size, turned as the photograph is (`size`)."""
+    header = read_header(mask)
+    as_shown = photograph.upright and not _of_one_shape(header.size, size)
+    kept = read_mask(mask, photograph.mask_keeps or "white", as_shown)
+    if as_shown and header.orientation == 1:  # programs that make masks may drop the tag
+        kept = TURNED[read_header(photograph.path).orientation](kept)
+    return kept
+
+
+def _resized(kept: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Return a mask at a size (width, height), by its nearest pixels."""
+    if kept.shape == size[::-1]:
+        return kept
+    row, column = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size[::-1], kept.shape, strict=True))
+    return np.asarray(kept[row[:, None], column])
 
 
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:

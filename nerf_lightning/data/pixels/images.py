@@ -17,22 +17,26 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, UInt8, UInt16
+from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from nerf_lightning.data.pixels.color_profiles import to_srgb
 from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, HEIC_KINDS, UNREAD, decoders
 from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.numpy_files import read_npy
+from nerf_lightning.files.regular import open_regular, other_format
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.row_chunks import row_chunks
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", *HEIC_ENDINGS)
-MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+ENDINGS = (".png", ".jpg", ".jpeg", ".jfif", ".jpe", ".tif", ".tiff", ".webp", ".avif", *HEIC_ENDINGS)
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 QUARTER_TURNS = (5, 6, 7, 8)
 """Orientations that swap width and height."""
 KEEP_ABOVE = 127
+MOST_LEVELS = 16
+"""Of green in a mask that is no cut-out photograph, at most."""
 MaskColor = Literal["white", "black"]
 PIXELS_AT_ONCE = 1 << 16
 """That are shrunk together: what is computed of them stays in the cache."""
@@ -107,15 +111,16 @@ def is_heic(path: Path) -> bool:
     return start[4:8] == b"ftyp" and start[8:12] in HEIC_KINDS
 
 
-def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height width 4"]:
+def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -> UInt8[np.ndarray, "height width 4"]:
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
-    Palettes and gray levels are expanded. Of 16 bits the upper byte is kept (less than one level off), which is said
-    once for each folder.
+    Palettes and gray levels are expanded, and colors are converted from the file's profile to sRGB. Of 16 bits the
+    upper byte is kept (less than one level off). Both are said once for each folder.
 
     Args:
         path: the file.
         upright: turn the pixels as an EXIF tag says; false returns them as they are stored.
+        converts_colors: false takes the numbers as they are, as masks need it.
 
     Raises:
         InputError: what `read_header` refuses, or damaged or truncated.
@@ -131,11 +136,12 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
         rgba = np.empty((image.height, image.width, 4), np.uint8)
+        convert = to_srgb(image, path.parent) if converts_colors else lambda part: part.convert("RGBA")
         for rows in row_chunks(*rgba.shape[:2]):  # several copies of the whole would be held at once
             part = image.crop((0, rows.start, image.width, rows.stop))
             if part.mode in GREY_16:
                 part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))
-            rgba[rows] = np.asarray(part if part.mode == "RGBA" else part.convert("RGBA"))
+            rgba[rows] = np.asarray(convert(part))
         return rgba
 
 
@@ -149,40 +155,60 @@ def _say_reduced(folder: Path) -> None:
     log.info("%s: pictures with 16 bits per channel are read with the upper 8", folder)
 
 
-def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
-    """Return the levels of a gray picture of 16 bits, as depth sensors write it.
+def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
+    """Return a depth map as it is stored: a gray picture of 16 bits, as sensors write it, or an array (.npy).
+
+    What is no depth is 0: NaN, infinity and numbers below.
 
     Raises:
         InputError: what `read_header` refuses, damaged, or of another kind.
     """
+    if path.suffix.lower() == ".npy":
+        depth = np.squeeze(read_npy(path, CURE))
+        if depth.ndim != 2 or depth.dtype.kind not in "fiu" or not depth.size:
+            raise InputError(f"The depth map {path} is not an array of numbers, height by width. Save it again.")
+        depth = depth.astype(np.float32)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     with opened_picture(path) as image:
         if image.mode not in GREY_16:
             raise InputError(f"The depth map {path} is not a 16-bit grayscale picture. Save it as a 16-bit PNG.")
         try:
-            return np.asarray(image).astype(np.uint16)
+            return np.asarray(image).astype(np.float32)
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
 
 
 def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels a picture keeps: those brighter than 127 of 255 or, where black is kept, the others.
+    """Return which pixels a picture keeps: the white ones or, where black is kept, the others.
 
-    Where alpha, or red, is all that differs from pixel to pixel, it is the mask.
+    White is brighter than 127 of 255; of two values on one side of that the larger one is, and 1 alone is white.
+    Where alpha, or red, is all that differs from pixel to pixel, it is the mask; of a cut-out photograph alpha is.
 
     Raises:
         InputError: what `read_rgba` refuses, and pictures with several channels that say different things.
     """
-    rgba = read_rgba(path, upright)
+    rgba = read_rgba(path, upright, converts_colors=False)
     # Of red, green, blue and alpha, those that differ from pixel to pixel.
     said = [rgba[..., channel] for channel in range(4) if np.ptp(rgba[..., channel])]
+    if np.ptp(rgba[..., 3]) and np.count_nonzero(np.bincount(rgba[..., 1].ravel())) > MOST_LEVELS:
+        said = [rgba[..., 3]]
     said = said or [rgba[..., 0]]
-    bright = [channel > KEEP_ABOVE for channel in said]
+    bright = [channel > _white_above(channel) for channel in said]
     if any((channel != bright[0]).any() for channel in bright[1:]):
         raise InputError(
             f"The mask {path} has colors or transparent pixels, so it is unclear which pixels it keeps. Save it as a "
             f"grayscale picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
         )
     return bright[0] if keep == "white" else ~bright[0]
+
+
+def _white_above(channel: UInt8[np.ndarray, "height width"]) -> int:
+    values = np.flatnonzero(np.bincount(channel.ravel()))
+    if values[0] <= KEEP_ABOVE < values[-1]:
+        return KEEP_ABOVE
+    if len(values) == 2:
+        return int(values[0])
+    return 0 if values[-1] == 1 else KEEP_ABOVE
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
@@ -345,11 +371,6 @@ def _check_plain(image: Image.Image, path: Path) -> None:
             f"{path} holds several pictures (an animation, or pages), and it is unclear which one is meant. Save each "
             "as a file of its own, for example with ffmpeg or `magick`, and name the one that belongs here."
         )
-    if image.mode == "CMYK":
-        raise InputError(
-            f"{path} has CMYK colors, which are for printing and can be read as RGB in several ways. Convert it with "
-            f"its color profile, for example `magick {path.name} -colorspace sRGB {path.stem}.png`."
-        )
     if image.mode not in MODES + GREY_16:
         raise InputError(
             f"{path} has the pixel mode {image.mode!r}, which cannot be read unambiguously as 8-bit color. Save it as "
@@ -364,6 +385,8 @@ def _unreadable(path: Path, error: Exception) -> str:
     if is_heic(path):
         cure = HEIC_CURE if "HEIF" not in decoders() else f"It cannot be decoded: {error}. {CURE}"
         return f"{path} is a photograph in the format HEIC. {cure}"
+    if (other := other_format(path)) is not None:
+        return f"{path} is {other}."
     if isinstance(error, UnidentifiedImageError):
         return f"{path} is not an image that can be read. {CURE}"
     return f"{path} cannot be read: {error}. It is damaged or was cut short. {CURE}"

@@ -29,7 +29,7 @@ from nerf_lightning.files.regular import AbsentError, open_own
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
 
-FORMAT = 2
+FORMAT = 3
 SPOTS, SPOT_BYTES = 64, 4096
 CHECKED_WHOLE = 1 << 32
 """Bytes of a file that is compared with its checksum at each start (0.4 s a gigabyte of what memory holds); of larger

@@ -19,7 +19,7 @@ from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.folders import conf_file, option_names
-from nerf_lightning.files.regular import contents
+from nerf_lightning.files.regular import contents, other_format
 from nerf_lightning.files.signatures import Signature, file_with
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -102,7 +102,7 @@ class AutoReader(CaptureReader):
         known = self._search()
         root = self.root if known.folder == self.folder() else str(known.folder)
         log.info("%s: read as scene=%s, because it has %s", root, known.scene, known.file)
-        chosen = self._chosen() | {"root": root, "name": self.name}
+        chosen = self._chosen() | {"root": self.root, "name": self.name}
         if not issubclass(known.reader, CaptureReader) and chosen.get("downscale") == "auto":
             del chosen["downscale"]  # of renderings, which are small
         refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
@@ -129,6 +129,9 @@ class AutoReader(CaptureReader):
         require_one([known.folder for known in found], self.root)
         if found:
             return found[0]
+        path = Path(self.root).expanduser()
+        if path.is_file() and (other := other_format(path)) is not None:
+            raise InputError(f"{self.root} is {other}.")
         formats = listed((Known(folder, "", reader).scene for reader in readers()), len(readers()))
         raise InputError(
             f"{self.root} holds no capture in a known format ({formats}): it holds {contents(folder)}.{self._hint()} "

@@ -19,9 +19,8 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import (
     PICTURE_FOLDERS,
     find_pictures,
-    is_absolute,
-    named_picture,
     pictures_below,
+    why_absent,
 )
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
@@ -106,7 +105,7 @@ class ColmapReader(CaptureReader):
         folder = self._model(root)
         model = read_model(folder)
         names, left_out = [image.name for image in model.images], LeftOut(str(folder))
-        where = root if self.images is None else root / self.images
+        where = self.top() if self.images is None else self.below(self.images)
         if not os.path.isdir(where):
             raise InputError(f"{where} {what_is(where)}. Set scene.images to the photographs' folder below {root}.")
         usual = [where] if self.images else [root / name for name in (*_beside(folder, root), *PICTURE_FOLDERS)]
@@ -116,7 +115,7 @@ class ColmapReader(CaptureReader):
         for image in model.images:
             with left_out.unless_usable(image.name):
                 if image.name not in files:
-                    raise InputError(_absent(image.name, pictures, folder))
+                    raise InputError(f"The model in {folder}: {why_absent(image.name, pictures, where)}")
                 camera = model.cameras.get(image.camera)
                 if camera is None:
                     raise InputError(
@@ -147,7 +146,7 @@ class ColmapReader(CaptureReader):
 
     def _model(self, root: Path) -> Path:
         if self.model is not None:
-            return root / self.model
+            return self.below(self.model)
         found = models_in(root)
         if not found:
             places = listed(filter(None, MODEL_FOLDERS), len(MODEL_FOLDERS))
@@ -197,24 +196,6 @@ def _tracks(images: Sequence[ColmapImage], points: ColmapPoints) -> Int[ndarray,
     return np.stack([point[known], order[row[known]]], axis=1)
 
 
-def _absent(name: str, pictures: Path, folder: Path) -> str:
-    if named_picture(pictures, name):
-        return (
-            f"The model in {folder} names {name}, which leads out of the capture's folder and is not followed, for "
-            "safety. If this capture is yours, add scene.allow_outside=true; otherwise copy the photograph into the "
-            "folder."
-        )
-    if is_absolute(name):
-        return (
-            f"The model in {folder} names photographs by absolute paths of another machine: {name}. No picture "
-            f"below {pictures} matches its end. Copy the photographs there, or set scene.images to their folder."
-        )
-    return (
-        f"{pictures} lacks the photograph {name} of the model in {folder}. Copy it there, or set scene.images to the "
-        "folder that has it."
-    )
-
-
 def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
     """Invert world-to-camera with axes right, down, forward into camera-to-world with axes right, up, back."""
     rotation = rotation_from_quaternion(torch.tensor(image.rotation, dtype=torch.float64))
@@ -262,23 +243,42 @@ def _number_of_images(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model, binary where there are two; refuse one that is not whole."""
-    ending = next((ending for ending in KINDS if (folder / f"cameras{ending}").is_file()), ".txt")
-    if ending == ".bin" and (folder / "cameras.txt").is_file():
+    """Read a model, each of its files in binary where there are two; refuse one that is not whole.
+
+    Sparse points that cannot be read are left out, which is said.
+    """
+    cameras_path, images_path, points_path = (_file_of(folder, name) for name in FILES)
+    if cameras_path.suffix == ".bin" and (folder / "cameras.txt").is_file():
         log.info("%s holds a model in binary and in text: the binary one is read", folder)
-    cameras_path, images_path, points_path = (folder / f"{name}{ending}" for name in FILES)
-    files = KINDS[ending]
     with reading(cameras_path, CURE):
-        cameras = list(files.cameras(cameras_path))
+        cameras = list(KINDS[cameras_path.suffix].cameras(cameras_path))
     twice = [number for number, count in Counter(camera.number for camera in cameras).items() if count > 1]
     if twice:
         raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
     with reading(images_path, CURE):
-        images = sorted(files.images(images_path), key=lambda image: image.name)
+        images = sorted(KINDS[images_path.suffix].images(images_path), key=lambda image: image.name)
     if not images:
         raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learned. {CURE}")
-    with reading(points_path, CURE):
-        points = files.points(points_path) if points_path.exists() else NO_POINTS
-    if points is NO_POINTS and (folder / PLY).is_file():
-        points = read_ply_points(folder / PLY)
+    points = _points(points_path, folder / PLY)
     return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
+
+
+def _file_of(folder: Path, name: str) -> Path:
+    """Return a file of a model, binary or text; where it is absent, it is missed beside others of its kind."""
+    endings = [ending for ending in KINDS if (folder / f"{name}{ending}").is_file()]
+    endings += [ending for ending in KINDS if any((folder / f"{other}{ending}").is_file() for other in FILES)]
+    ending = next(iter(endings), ".txt")
+    return folder / f"{name}{ending}"
+
+
+def _points(path: Path, ply: Path) -> ColmapPoints:
+    """Return the sparse points of a model, or of the PLY file that 3DGS writes; none where they cannot be read."""
+    try:
+        with reading(path, "They are not needed for training."):
+            if path.exists():
+                return KINDS[path.suffix].points(path)
+            if ply.is_file():
+                return read_ply_points(ply)
+    except InputError as error:
+        log.warning("The sparse points are left out: %s", error)
+    return NO_POINTS

@@ -4,13 +4,17 @@ They are parsed here: COLMAP's own library hangs on some truncated ones. What a 
 to catch (`files.trust.reading`).
 """
 
+import logging
 import math
 import mmap
 import os
 import struct
 from array import array
+from codecs import getincrementaldecoder
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +48,15 @@ MODELS = {
 }
 """COLMAP's numbers of camera models, with their names and counts of parameters."""
 COUNTS = dict(MODELS.values())
+WINDOWS = "cp1252"
 LONGEST_NAME = 1 << 14
 """In bytes."""
 MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
 """Points, spread over all, whose tracks are read, up to `budgets.points` entries; photographs that a track may have."""
 CURE = "Copy the model again, or run the reconstruction again (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -177,7 +184,11 @@ class _Bytes:
         if end < 0:
             raise ValueError(f"it ends within a name, or has one of more than {LONGEST_NAME:,} bytes")
         name, self.place = self.data[self.place : end], end + 1
-        return name.decode("utf-8")
+        try:
+            return name.decode("utf-8")
+        except UnicodeDecodeError:
+            _say_of_encoding(self.path)
+            return name.decode(WINDOWS)
 
     def end(self) -> None:
         if self.place != len(self.data):
@@ -237,9 +248,30 @@ class TextFiles:
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
     """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
     with open_regular(path, "colmap", CURE) as file:
-        for number, line in enumerate(read_lines(file, encoding_of(file)), start=1):
+        encoding = encoding_of(file)
+        if keep_empty and encoding == "utf-8-sig" and not _is_utf8(file):  # of photographs, which have names
+            encoding = WINDOWS
+            _say_of_encoding(path)
+        for number, line in enumerate(read_lines(file, encoding), start=1):
             if not line.startswith("#") and (keep_empty or line.strip()):
                 yield f"{path}, line {number}", line.strip()
+
+
+def _is_utf8(file: BufferedReader) -> bool:
+    decoder = getincrementaldecoder("utf-8")()
+    try:
+        while part := file.read(1 << 20):
+            decoder.decode(part)
+        return True
+    except UnicodeDecodeError:
+        return False
+    finally:
+        file.seek(0)
+
+
+@cache
+def _say_of_encoding(path: Path) -> None:
+    log.warning("%s is not UTF-8: its names are read in the encoding of Windows (%s)", path, WINDOWS)
 
 
 def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterator[tuple[str, str]]:

@@ -14,9 +14,10 @@ from typing import Any
 from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures, is_absolute, named_picture
+from nerf_lightning.data.captures.pictures import find_pictures, why_absent
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
+from nerf_lightning.data.readers.frame_keys import say_of_keys
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.messages.errors import InputError
@@ -40,8 +41,12 @@ LENSES: dict[str, LensModel] = {
     "EQUIRECTANGULAR": "equirectangular",
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-RATIONAL = ("k4", "k5", "k6")
-"""Of FULL_OPENCV: what the radial distortion is divided by."""
+OF_OTHERS = ("ftheta_p0", "latlong", "equirectangular")
+"""Keys of instant-ngp's lenses that are not read."""
+ANGLES = {"camera_angle_": (math.pi, "pi radians"), "_fov": (180.0, "180 degrees")}
+"""What a field of view is below, by its key."""
+TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
+"""Keys of instant-ngp, by which pixels of that level have no content."""
 FORMAT = "A transforms.json of nerfstudio or instant-ngp"
 
 log = logging.getLogger(__name__)
@@ -80,6 +85,8 @@ def say_of_files(files: Sequence[FrameFile]) -> None:
             "Frames are read from %s, and not from %s (scene=transforms scene.file=NAME reads another file)",
             *(listed((file.path for file in files), 3), listed(beside)),
         )
+    for file in files:
+        say_of_keys(file.path, (file.content, *(frame for frame in file.frames if isinstance(frame, dict))))
     times = {
         repr(frame["time"]) for file in files for frame in file.frames if isinstance(frame, dict) and "time" in frame
     }
@@ -121,7 +128,7 @@ def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, ever
     for where, name, frame in named:
         with left_out.unless_usable(PurePosixPath(name.replace("\\", "/")).as_posix()):
             if name not in pictures:
-                raise InputError(_absent(file.path, root, where, name))
+                raise InputError(f"{where}: {why_absent(name, file.path.parent, root)}")
             found.append(_found(file, f"{where} ({name})", name, frame, pictures[name]))
     return found
 
@@ -134,10 +141,17 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
     # The intrinsics may be those of another size.
     width, height = number_of(settings, "w", where, stored_width), number_of(settings, "h", where, stored_height)
     focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
-    folder = file.path.parent
+    folder, dynamic = file.path.parent, picture.with_name(f"dynamic_mask_{picture.name}").with_suffix(".png")
     view = View(
         name=picture.relative_to(folder if picture.is_relative_to(folder) else picture.anchor).as_posix(),
-        photograph=Photograph(picture, header=header),
+        photograph=Photograph(
+            picture,
+            mask=dynamic if dynamic.is_file() else None,
+            mask_keeps="black" if dynamic.is_file() else None,
+            radius=_radius(settings, stored_width / width, where),
+            transparent=next((level for key, level in TRANSPARENT.items() if settings.get(key) is True), None),
+            header=header,
+        ),
         c2w=pose_from_matrix(frame["transform_matrix"], f"{where}: transform_matrix"),
         focal=focal(settings, width, height, where),
         center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),
@@ -147,22 +161,11 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
     return FoundFrame(name, settings, view, lens_model)
 
 
-def _absent(path: Path, root: Path, where: str, name: str) -> str:
-    named = path.parent / name.replace("\\", "/")
-    if named_picture(path.parent, name):
-        return (
-            f"{where}: file_path is {name}, which leads out of the capture's folder {root}: it may be a stranger's. If "
-            "this capture is yours, add scene.allow_outside=true; otherwise copy the picture into the folder."
-        )
-    if is_absolute(name):
-        return (
-            f"{where}: file_path is {name}, an absolute path of another machine, and no picture below {root} matches "
-            "its end. Copy the pictures there."
-        )
-    return (
-        f"{where}: the image {named} does not exist, and neither does one with another extension. Copy it there, or "
-        "remove its frame from the file."
-    )
+def _radius(settings: dict[str, Any], scale: float, where: str) -> float | None:
+    """Return the circle of a fisheye that counts (nerfstudio), in pixels of the picture that is there."""
+    if not settings.get("fisheye_crop_radius"):
+        return None
+    return scale * positive_of(settings, "fisheye_crop_radius", where)
 
 
 def path_of(name: object, key: str, where: str) -> str:
@@ -192,12 +195,12 @@ def positive_of(settings: dict[str, Any], key: str, where: str, default: float |
     return value
 
 
-def focal_of_angle(settings: dict[str, Any], side: str, length: float, where: str) -> float:
-    """Return the focal length in pixels of a field of view of `camera_angle_x` or `_y` radians, between 0 and pi."""
-    angle = number_of(settings, f"camera_angle_{side}", where)
-    if not 0.0 < angle < math.pi:
-        raise InputError(f"{where}: camera_angle_{side} is {angle}, but it must lie between 0 and pi radians.")
-    return focal_from_fov(length, angle)
+def focal_of_angle(settings: dict[str, Any], key: str, length: float, where: str) -> float:
+    """Return the focal length in pixels of the field of view under a key: in radians, in degrees for `x_fov`."""
+    angle, (half_turn, unit) = number_of(settings, key, where), ANGLES[key.strip("xy")]
+    if not 0.0 < angle < half_turn:
+        raise InputError(f"{where}: {key} is {angle}, but it must lie between 0 and {unit}.")
+    return focal_from_fov(length, angle * math.pi / half_turn)
 
 
 def focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
@@ -206,12 +209,13 @@ def focal_of(settings: dict[str, Any], width: float, height: float, where: str) 
     for side, length in (("x", width), ("y", height)):
         if f"fl_{side}" in settings:
             found.append(number_of(settings, f"fl_{side}", where))
-        elif f"camera_angle_{side}" in settings:
-            found.append(focal_of_angle(settings, side, length, where))
+        elif key := next((key for key in (f"{side}_fov", f"camera_angle_{side}") if key in settings), None):
+            found.append(focal_of_angle(settings, key, length, where))
     if not found:
         raise InputError(
-            f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) is given in it or at the "
-            "top of the file. If the file comes from another tool, export it in nerfstudio's or instant-ngp's format."
+            f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) nor x_fov (degrees) is "
+            "given in it or at the top of the file. If the file comes from another tool, export it in nerfstudio's or "
+            "instant-ngp's format."
         )
     return found[0], found[-1]
 
@@ -240,6 +244,9 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     k1, k2, k3, k4, p1, p2 = (number_of(settings, key, where, 0.0) for key in COEFFICIENTS)
     lens = (k1, k2, k3, k4, p1, p2)
     model = settings.get("camera_model", "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV")
+    other = next((key for key in OF_OTHERS if settings.get(key)), None)
+    if other is not None:
+        raise InputError(f"{where} has {other}, a lens of instant-ngp that is not supported. Use perspective pictures.")
     kind = LENSES.get(model.strip().upper()) if isinstance(model, str) else None
     if kind is None:
         raise InputError(
@@ -248,9 +255,11 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
         )
     if kind in ("pinhole", "equirectangular") and any(lens):
         raise InputError(f"{where} has the camera_model {model} and distortion coefficients. Remove one of them.")
-    if str(model).upper() == "FULL_OPENCV" and any(number_of(settings, key, where, 0.0) for key in RATIONAL):
+    # The radial distortion is divided by 1 + k4 r^2 + k5 r^4 + k6 r^6; without k5 and k6, k4 is nerfstudio's r^8.
+    divided = ("k4", "k5", "k6") if str(model).upper() == "FULL_OPENCV" else ("k5", "k6")
+    if kind == "radial_tangential" and any(number_of(settings, key, where, 0.0) for key in divided):
         raise InputError(
-            f"{where} has the camera_model {model} with k4, k5 or k6, which divide the distortion and are not "
-            "supported. Calibrate with OPENCV, or undistort the photographs."
+            f"{where} has the camera_model {model} with {listed(divided)}, which divide the distortion (a rational "
+            "lens) and are not supported. Calibrate with OPENCV (k1, k2, p1, p2), or undistort the photographs."
         )
     return ("pinhole" if kind == "radial_tangential" and not any(lens) else kind), lens

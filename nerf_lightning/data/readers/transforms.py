@@ -32,6 +32,7 @@ from nerf_lightning.nerf.geometry.poses import is_rigid
 
 NGP_SCALE = 0.33
 SPLITS = ("train", "val", "test")
+DEPTH_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 
 log = logging.getLogger(__name__)
 
@@ -43,14 +44,16 @@ class TransformsReader(CaptureReader):
     Args:
         file: the JSON file below root; paths in it are relative to its folder. null: transforms.json, or all
             transforms_*.json as one capture, whose splits are train, val and test.
-        depth_unit: length of one level of the 16-bit depth maps (`depth_file_path`), in the capture's units.
+        depth_unit: length of a unit of the depth maps (`depth_file_path`, `depth_path`), in the capture's units. null:
+            what the file says (`depth_unit_scale_factor`, `integer_depth_scale`), or else 0.001 of whole numbers and 1
+            of others.
     """
 
     named_by = (".json",)
 
     name: str = "transforms"
     file: str | None = None
-    depth_unit: float = 1e-3
+    depth_unit: float | None = None
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
@@ -63,24 +66,23 @@ class TransformsReader(CaptureReader):
         left_out, files = LeftOut(str(paths[0])), [FrameFile.read(path) for path in paths]
         if self.file is None:
             say_of_files(files)
-        each = [views_of(file, self.folder(), self.allow_outside, left_out) for file in files]
+        each = [views_of(file, self.top(), self.allow_outside, left_out) for file in files]
         found = [frame for frames in each for frame in frames]
         left_out.require_enough(len(found))
-        views = self._with_masks_and_depths(paths[0], found)
-        left_out.without_pose = self._without_pose(views, left_out)
         undo = _undo_of(files)
+        views = self._with_masks_and_depths(paths[0], found, 1.0 / unit_of(undo))
+        left_out.without_pose = self._without_pose(views, left_out)
         return Capture(
             views=tuple(views),
             source=paths[0],
             lens_model=one_lens_model({frame.lens_model for frame in found}, paths[0]),
-            points=_points(files, self.folder(), self.allow_outside),
+            points=_points(files, self.top(), self.allow_outside),
             splits=_splits(files[0], found)
             if len(files) == 1
             else _splits_of_files(paths, [len(each_) for each_ in each]),
             undo=undo,
             box=next((box for file in files if (box := _ngp_box(file.content, str(file.path))) is not None), None),
             left_out=left_out,
-            depth_unit=self.depth_unit / unit_of(undo),  # depths are those before applied_scale
         )
 
     def _paths(self) -> list[Path]:
@@ -105,20 +107,36 @@ class TransformsReader(CaptureReader):
         base = folder.relative_to(root)
         return tuple((base / name).as_posix() for name in picture_files(folder) if folder / name not in named)
 
-    def _with_masks_and_depths(self, path: Path, found: list[FoundFrame]) -> list[View]:
-        """Return the views with the files that frames name beside their pictures."""
-        masks, depths = (self._files_of(path, found, key) for key in ("mask_path", "depth_file_path"))
-        return [
-            replace(each.view, photograph=replace(each.view.photograph, mask=mask), depth=depth)
-            for each, mask, depth in zip(found, masks, depths, strict=True)
-        ]
+    def _with_masks_and_depths(self, path: Path, found: list[FoundFrame], scale: float) -> list[View]:
+        """Return the views with the files that frames name beside their pictures.
+
+        Depths are those before applied_scale, which `scale` makes good for.
+        """
+        masks, depths, others = (
+            self._files_of(path, found, key) for key in ("mask_path", "depth_file_path", "depth_path")
+        )
+        views = []
+        for each, mask, depth, other in zip(found, masks, depths, others, strict=True):
+            units = [positive_of(each.settings, key, str(path)) for key in DEPTH_UNITS if key in each.settings]
+            unit, photograph = self.depth_unit or next(iter(units), None), each.view.photograph
+            if mask is not None:
+                photograph = replace(photograph, mask=mask, mask_keeps=None)
+            depth = depth or other
+            if depth is not None and unit is None:
+                unit = 1.0 if depth.suffix == ".npy" else 1e-3
+            views.append(replace(each.view, photograph=photograph, depth=depth, depth_unit=scale * (unit or 1.0)))
+        return views
 
     def _files_of(self, path: Path, found: list[FoundFrame], key: str) -> list[Path | None]:
         """Return the file that each frame names by a key; those that are not there are named, and their frames stay."""
         names = [str(each.settings[key]) if each.settings.get(key) else None for each in found]
         wanted = [name for name in names if name is not None]
         photographs = {each.view.photograph.path for each in found}
-        files = find_pictures(wanted, path.parent, self.folder(), path, self.allow_outside, beside=photographs)
+        files = find_pictures(wanted, path.parent, self.top(), path, self.allow_outside, beside=photographs)
+        if key != "mask_path":
+            files |= _arrays(
+                [name for name in wanted if name not in files], path.parent, self.top(), self.allow_outside
+            )
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
@@ -130,6 +148,16 @@ class TransformsReader(CaptureReader):
                 listed(absent, 3),
             )
         return [None if name is None else files.get(name) for name in names]
+
+
+def _arrays(names: list[str], folder: Path, root: Path, outside: bool) -> dict[str, Path]:
+    """Return the files of numpy's that depth maps may be."""
+    paths = {name: folder / name.replace("\\", "/") for name in names if name.lower().endswith(".npy")}
+    return {
+        name: path
+        for name, path in paths.items()
+        if os.path.isfile(path) and (outside or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)))
+    }
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -191,7 +219,7 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
     # As the frames write them, too: without an ending, say.
     numbers = {name: n for n, each in enumerate(found) for name in (each.view.name, _plain(each.name))}
     listed_at_all = {_plain(frame.get("file_path")) for frame in file.frames if isinstance(frame, dict)}
-    splits = {}
+    splits: dict[str, tuple[int, ...]] = {}
     for split in SPLITS:
         names = lists.get(split, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -200,6 +228,9 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
         if lost:
             log.warning("%s: %s_filenames lists %s, which no frame has; these are ignored", path, split, listed(lost))
         splits[split] = tuple(dict.fromkeys(numbers[_plain(name)] for name in names if _plain(name) in numbers))
+    if "train" not in lists:
+        held = {*splits["val"], *splits["test"]}
+        splits["train"] = tuple(number for number in range(len(found)) if number not in held)
     unused = [each.view.name for number, each in enumerate(found) if all(number not in splits[key] for key in SPLITS)]
     if unused:
         log.warning(
@@ -220,8 +251,9 @@ def _ngp_box(content: dict[str, Any], where: str) -> Float[Tensor, "2 3"] | None
     if "aabb_scale" not in content:
         return None
     size, scale = positive_of(content, "aabb_scale", where), positive_of(content, "scale", where, NGP_SCALE)
-    offset = content.get("offset", [0.5, 0.5, 0.5])
-    if not isinstance(offset, list) or len(offset) != 3:
+    offset = content.get("offset", 0.5)
+    offset = offset if isinstance(offset, list) else [offset] * 3
+    if len(offset) != 3:
         raise InputError(f"{where}: offset is {offset!r}, but must be three numbers. Remove it, or export again.")
     numbers = [number_of({"offset": number}, "offset", where) for number in offset]
     middle, half = (0.5 - torch.tensor(numbers, dtype=torch.float64)) / scale, 0.5 * size / scale

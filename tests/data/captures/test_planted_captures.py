@@ -233,18 +233,18 @@ def bombs(tmp_path):
         root = WRITERS["colmap"](tmp_path / name)
         path = root / MODEL / f"{name}.bin"
         path.write_bytes(struct.pack("<Q", most) + path.read_bytes()[8:])
-        yield "colmap", root, "it claims .* Copy the model again"
+        yield "colmap", root, "no points" if name == "points3D" else "it claims .* Copy the model again"
     root = WRITERS["colmap"](tmp_path / "sparse")
     with (root / MODEL / "points3D.bin").open("r+b") as file:
         file.truncate(50_000_000_000)
-    yield "colmap", root, "it claims .* bytes, but has 50,000"
+    yield "colmap", root, "no points"
     root = WRITERS["text"](tmp_path / "line")
     with (root / MODEL / "images.txt").open("r+b") as file:
         file.truncate(20_000_000_000)
     yield "colmap", root, "has more than 16,777,216 characters"
     root = WRITERS["text"](tmp_path / "lines")
     (root / MODEL / "points3D.txt").write_bytes(b"\n" * 4 * MEGABYTE + b"1 x\n")
-    yield "colmap", root, "line 4194305 cannot be read"
+    yield "colmap", root, "no points"
     for name, text, words in (
         ("deep", "[" * 10**6, "nests its brackets too deeply"),
         ("nested", '{"frames": ' + "[" * 500 + "]" * 500 + "}", "frames"),
@@ -273,7 +273,8 @@ read("colmap", Path(good))
 for kind, place, words in kinds:
     try:
         read_whole = NpzReader(place).read() if kind == "npz" else read(kind, Path(place))
-        if len(read_whole.view_names) != 8 or "megapixels" not in words:
+        without = words == "no points" and not len(read_whole.points)
+        if not without and (len(read_whole.view_names) != 8 or "megapixels" not in words):
             print(place, "was read")
     except InputError as error:
         if not re.search(words, str(error)):

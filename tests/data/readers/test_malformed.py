@@ -85,8 +85,8 @@ TRANSFORMS = {
     "frames by name": (top(frames={"a": 1}), r"frames must be a list of views, but it is dict"),
     "no frames": (top(frames=[]), r"transforms.json lists no views"),
     "other frames": (top(frames=[{"file_path": "a.png", "pose": 1}]), r"\[0\] lacks transform_matrix; it has"),
-    "a path of Windows": (frame(2, file_path="C:\\Users\\a.jpg"), r"\[2\]: file_path is C:.*an absolute path of"),
-    "an absolute path": (frame(2, file_path="/home/a.jpg"), r"\[2\]: file_path is /home/a.jpg, an absolute path"),
+    "a path of Windows": (frame(2, file_path="C:\\Users\\a.jpg"), r"\[2\]: C:.*an absolute path of"),
+    "an absolute path": (frame(2, file_path="/home/a.jpg"), r"\[2\]: /home/a.jpg is an absolute path"),
     "an absent image": (frame(2, file_path="images/no.png"), r"\[2\]: the image \S+images/no.png does not exist"),
     "a long name": (frame(2, file_path="images/" + "x" * 5000), r"frames\[2\].* more than 1024 characters"),
     "an image by number": (frame(2, file_path=7), r"frames\[2\]: file_path is 7, but it must be a path as text"),
@@ -222,9 +222,12 @@ COLMAP = {
     "files exchanged": (exchanged, r"(cameras|images).bin (cannot be read|holds)"),
     "more announced": (text(IMAGES, lambda old: struct.pack("<Q", 1 << 60) + old[8:]), r"images.bin .*claims \S+ en"),
     "more features announced": (text(IMAGES, lambda _: FEATURES), r"images.bin .*claims \S+ bytes"),
-    "a name that is no text": (swap(b"p_0.png", b"\xffp_0.png"), r"images.bin cannot be read \(UnicodeDecodeError"),
+    "a name that is no text": (
+        swap(b"p_0.png", b"\xffp_0.png"),
+        r"images.bin is not UTF-8: its names are read in the enc",
+    ),
     "a photograph twice": (swap(b"p_0.png", b"p_1.png"), r"lists p_1.png more than once, with different"),
-    "a photograph without a name": (swap(b"p_0.png", b""), r"lacks the photograph  of"),
+    "a photograph without a name": (swap(b"p_0.png", b""), r"the image \S+images does not exist"),
     "a camera twice": (cameras(1, *PINHOLE, views=(7, 7)), r"cameras.bin holds 7 more than once"),
     "unlisted cameras": (cameras(1, *PINHOLE, views=(1,)), r"a camera that does not exist: 2\. .* 8 of the 9 views"),
     "a point with NaN": (point(np.nan), FAR_POINT),
@@ -234,9 +237,9 @@ COLMAP = {
     "another size": (cameras(1, 20.0, 20.0, 800.0, 600.0), r"principal point at 800, 600, outside of its 16 x 12"),
     "no size": (cameras(1, *PINHOLE, size=(0, 0)), r"has the focal length 20, 20 for 0 x 0 pixels; all must be above"),
     "a fold": (cameras(2, 10.0, 8.0, 6.0, -2.0), r"The lens of p_0.png .*folds back .* Check the coefficients"),
-    "a photograph missing": (lambda root: one_picture(root).unlink(), r"images lacks the photograph p_3.png of"),
-    "an absolute name": (swap(b"p_0.png", b"/home/a.jpg"), r"by absolute paths of another machine: /home/a.jpg. No"),
-    "a long name": (swap(b"p_0.png", b"x" * 5000), r"images lacks the photograph x"),
+    "a photograph missing": (lambda root: one_picture(root).unlink(), r"the image \S+images/p_3.png does not exist"),
+    "an absolute name": (swap(b"p_0.png", b"/home/a.jpg"), r"/home/a.jpg is an absolute path of another machine"),
+    "a long name": (swap(b"p_0.png", b"x" * 5000), r"the image \S+images/x+ does not exist"),
 }
 
 
@@ -258,7 +261,10 @@ TEXT = {
     "words": (lines("images.txt", lambda old: old.replace("10 ", "10 one ", 1)), r"images.txt, line 3 .*float: 'one'"),
     "no features": (lines("images.txt", without_features), r"line 3 .*the next line must hold features"),
     "cut short": (lines("images.txt", lambda old: old[: old.index(" p_8.png")]), r"line 19 .*expected 7, got 6"),
-    "points cut short": (lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]), r"line 60 .*expected 3"),
+    "points cut short": (
+        lines("points3D.txt", lambda old: old[: old.rindex("\n59 ") + 4]),
+        r"left out: .*line 60 .*exp",
+    ),
     "binary": (text(MODEL / "images.txt", lambda _: b"\xff\xfe\x00"), r"images.txt cannot be read \(Unicode"),
     "a point far away": (lines("points3D.txt", lambda old: re.sub(r"(?m)^0 \S+", "0 -1e300", old)), FAR_POINT),
 }
@@ -285,14 +291,14 @@ PHOTOGRAPHS = {
         r"p_3.png has 12 x 12 pixels, but its camera was calibrated for 16 x 12: .* use the original one",
     ),
     "empty": (picture(lambda _: b""), r"p_3.png is empty \(0 bytes\). Copy or render it again"),
-    "text": (picture(lambda _: b"<html>404</html>"), r"p_3.png is not an image that can be read"),
+    "text": (picture(lambda _: b"<html>404</html>"), r"p_3.png is a web page"),
     "cut short": (picture(lambda old: old[:-150]), r"p_3.png cannot be read: .* cut short"),
     "no pixels": (picture(lambda _: png_header(0, 0)), r"p_3.png is not an image that can be read. Copy or render"),
     "200 megapixels": (picture(lambda _: png_header(20_000, 10_000)), r"more megapixels than the limit of 178"),
     "HEIC": (picture(lambda _: b"\0\0\0\x18ftypheic" + bytes(100)), r"p_3.png is a photograph in the format HEIC"),
     "a link to itself": (
         link_to_itself,
-        r"(lacks the photograph p_3.png|p_3.png is a symbolic link to .*, which leads nowhere)",
+        r"(p_3.png does not exist|p_3.png is a symbolic link to .*, which leads nowhere)",
     ),
 }
 ONE_VIEW = {
@@ -302,7 +308,10 @@ ONE_VIEW = {
         *("a pose of one number", "a pose with NaN", "a camera far away", "a mask of another size"),
     },
     "llff": {"NaN in a pose"},
-    "colmap": {"a photograph without a name", "no rotation", "a photograph missing", "an absolute name", "a long name"},
+    "colmap": {
+        *("a photograph without a name", "no rotation", "a photograph missing", "an absolute name", "a long name"),
+        "a name that is no text",
+    },
     "text": set[str](),
     "photographs": set(PHOTOGRAPHS),
 }
@@ -311,7 +320,7 @@ NO_VIEW = {
     "transforms": {"a mask by number", "an absent mask", "nothing held out"},
     "llff": {"infinite depth", "bounds exchanged"},
     "colmap": {"a point with NaN", "a point beyond float32"},
-    "text": {"a point far away"},
+    "text": {"a point far away", "points cut short"},
     "photographs": set[str](),
 }
 """What is passed over."""
@@ -438,7 +447,10 @@ def test_a_binary_cut_or_changed_anywhere_is_refused_or_read(tmp_path, name):
     content = path.read_bytes()
     for size in sorted({0, 1, 7, 8, 9, *range(10, len(content), 37), len(content) - 1}):
         path.write_bytes(content[:size])
-        refused("colmap", root, rf"{name}.bin cannot be read \(.* Copy the model again, or run")
+        if name == "points3D":  # they are not needed
+            assert len(read("colmap", root).points) == 0
+        else:
+            refused("colmap", root, rf"{name}.bin cannot be read \(.* Copy the model again, or run")
     rng = np.random.default_rng(4)
     for place in range(0, min(len(content), 200), 5):
         damaged = bytearray(content)

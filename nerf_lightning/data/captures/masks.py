@@ -1,0 +1,86 @@
+"""Which photograph has which mask: as the capture's files say, as scene.masks says, or by a folder called masks."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
+from nerf_lightning.files.regular import contents
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
+
+FOLDERS = ("masks", "mask")
+NO_MASKS = "none"
+
+log = logging.getLogger(__name__)
+
+
+def with_masks(capture: Capture, masks: str | None, folders: Sequence[Path], keeps: str) -> Capture:
+    """Return the views with their masks; photographs without one are kept whole.
+
+    Args:
+        capture: its views may have masks already, which its files name.
+        masks: a folder below one of `folders`, none, or None for what the files name, or else for a folder beside the
+            photographs that has one mask for each of them.
+        folders: those that masks may lie in, the first one first.
+        keeps: the color of what is kept, for messages.
+
+    Raises:
+        InputError: the folder that was named has none, or there are none whose color could matter.
+    """
+    found = {view.name: view.photograph.mask for view in capture.views if view.photograph.mask is not None}
+    if masks == NO_MASKS:
+        found = {}
+    elif masks is not None:
+        folder = next((path for each in folders if (path := each / masks).is_dir()), folders[-1] / masks)
+        named = _masks_in(folder, capture)
+        if not named:
+            first = capture.views[0].name
+            raise InputError(
+                f"scene.masks={masks} holds no mask for any photograph of {capture.source}: {folder} holds "
+                f"{contents(folder)}. A mask is named after its photograph ({first}, with .png added, or with .png or "
+                "_mask.png instead of its extension)."
+            )
+        found |= named
+    elif not found:
+        found = _masks_beside(folders, capture)
+    views = tuple(
+        replace(view, photograph=replace(view.photograph, mask=found.get(view.name))) for view in capture.views
+    )
+    if not found and keeps == "black":
+        raise InputError(
+            f"scene.masks_keep=black, but no photograph of {capture.source} has a mask. Name their folder with "
+            "scene.masks=FOLDER, or leave out masks_keep."
+        )
+    whole = [view.name for view in views if view.photograph.mask is None]
+    if found and whole:
+        log.warning("%d of %d photographs have no mask and are kept whole: %s", len(whole), len(views), listed(whole))
+    return replace(capture, views=views)
+
+
+def _masks_beside(folders: Sequence[Path], capture: Capture) -> dict[str, Path]:
+    """Return the masks of a folder that nothing names, where it has one for each photograph; say what is done."""
+    for folder in dict.fromkeys(each / name for each in folders for name in FOLDERS):
+        if not folder.is_dir() or not pictures_below(folder):
+            continue
+        found, views = _masks_in(folder, capture), len(capture.views)
+        if len(found) == views:
+            log.info(
+                "%s: %s has a mask for each photograph, which is used (scene.masks=none does without; "
+                "scene.masks=%s names the folder)",
+                *(capture.source, folder, folder.name),
+            )
+            return found
+        if found:
+            log.warning(
+                "%s: %s has masks for %d of %d photographs and is not used; scene.masks=%s uses it",
+                *(capture.source, folder, len(found), views, folder.name),
+            )
+    return {}
+
+
+def _masks_in(folder: Path, capture: Capture) -> dict[str, Path]:
+    photographs = {view.photograph.path for view in capture.views}
+    return find_pictures([view.name for view in capture.views], folder, folder, capture.source, beside=photographs)

@@ -1,0 +1,72 @@
+"""Color profiles (ICC): what phones and cameras save in other colors becomes sRGB, which everything here expects."""
+
+import io
+import logging
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageCms
+
+from nerf_lightning.messages.escaping import for_terminal
+
+ROUNDING = 2
+"""Levels of 255 by which a profile may differ from sRGB and count as sRGB."""
+LEVELS = np.linspace(0, 255, 9).round().astype(np.uint8)
+MODES = {"1": "L", "L": "L", "LA": "L", "P": "RGB", "PA": "RGB", "RGB": "RGB", "RGBA": "RGB", "CMYK": "CMYK"}
+"""The mode that profiles are about, by that of the picture."""
+
+log = logging.getLogger(__name__)
+
+
+def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.Image]:
+    """Return what makes parts of a picture RGBA in sRGB; alpha is kept.
+
+    What is converted is said once for each folder. A profile that cannot be used is ignored.
+
+    Args:
+        image: the picture, decoded.
+        folder: where it lies, for the message.
+    """
+    profile, mode = image.info.get("icc_profile"), MODES.get(image.mode)
+    name, transform = _transform(profile, mode) if profile and mode else ("", None)
+    if transform is None or mode is None:
+        if image.mode == "CMYK":
+            _say(folder, "CMYK colors without a usable profile are converted to sRGB approximately")
+        return lambda part: part if part.mode == "RGBA" else part.convert("RGBA")
+    _say(folder, f"colors are converted from the profile {name} to sRGB")
+
+    def convert(part: Image.Image) -> Image.Image:
+        rgba = part.convert("RGBA")
+        plain = rgba.convert("RGB") if mode == "RGB" else part.convert(mode)
+        plain = ImageCms.applyTransform(plain, transform) or plain
+        plain.putalpha(rgba.getchannel("A"))
+        return plain
+
+    return convert
+
+
+@lru_cache(maxsize=64)
+def _transform(profile: bytes, mode: str) -> tuple[str, ImageCms.ImageCmsTransform | None]:
+    """Return a profile's name, and what takes its colors to sRGB; None where it is sRGB, damaged, or of other modes."""
+    try:
+        known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(known, ImageCms.createProfile("sRGB"), mode, "RGB")
+        samples = Image.fromarray(_lattice(len(mode) if mode != "L" else 1), mode)
+        changed = np.asarray(ImageCms.applyTransform(samples, transform)).astype(int)
+        name = ImageCms.getProfileDescription(known).strip()
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return "", None
+    is_srgb = mode != "CMYK" and np.abs(changed - np.asarray(samples.convert("RGB"))).max() <= ROUNDING
+    return for_terminal(name) or "without a name", None if is_srgb else transform
+
+
+def _lattice(channels: int) -> np.ndarray:
+    colors = np.stack(np.meshgrid(*[LEVELS] * channels, indexing="ij"), axis=-1).reshape(1, -1, channels)
+    return colors[..., 0] if channels == 1 else colors
+
+
+@cache
+def _say(folder: Path, what: str) -> None:
+    log.info("%s: %s", for_terminal(str(folder)), what)
