@@ -96,14 +96,14 @@ class PosedReader(CaptureReader):
             items: what it lists, by where that stands in it.
             posed: returns the picture of an item, which stands at a place (for messages).
             folder: what names are relative to; None: where photographs usually lie.
-            root: the folder below which pictures are looked for; None: the capture's.
+            root: the folder below which pictures are looked for; None: the one that the user named.
             more: further values of `Capture`.
         """
         require_within("views", len(items), source, "views")
-        root = root or self.folder()
         if self.images is not None:
-            folder = root = self.folder() / self.images
-        folder = folder or first_with_pictures(root, FOLDERS) or root
+            folder = root = self.below(self.images)
+        bases, root = [root or self.folder(), self.top()], root or self.top()
+        folder = folder or first_with_pictures(self.folder(), FOLDERS) or root
         left_out, named = LeftOut(str(source)), list[Posed]()
         for place, item in items.items():
             with left_out.unless_usable(place):
@@ -120,9 +120,10 @@ class PosedReader(CaptureReader):
                 header = read_header(picture)
                 width, height = map(float, header.size)
                 c2w, camera = each.camera((width, height))
+                below = (picture.relative_to(base) for base in bases if picture.is_relative_to(base))
                 views.append(
                     View(
-                        name=(picture.relative_to(root) if picture.is_relative_to(root) else picture).as_posix(),
+                        name=next(below, picture).as_posix(),
                         photograph=Photograph(picture, header=header),
                         c2w=c2w,
                         focal=camera.focal,

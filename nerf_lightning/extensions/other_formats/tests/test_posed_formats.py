@@ -390,3 +390,15 @@ def test_renderings_in_the_output_of_3dgs_are_no_photographs(tmp_path):
     for root in (tmp_path, tmp_path / "cameras.json"):
         with pytest.raises(InputError, match=r"output of .* source_path"):
             read(root)
+
+
+def test_pictures_may_lie_anywhere_in_the_folder_that_is_named(tmp_path):
+    write_meshroom(tmp_path, KNOWN)
+    folder = tmp_path / "MeshroomCache" / "StructureFromMotion" / "0a1b"
+    folder.mkdir(parents=True)
+    (tmp_path / "cameras.sfm").rename(folder / "cameras.sfm")
+    (tmp_path / "images").rename(tmp_path / "photos")
+    assert_known(AutoReader(root=str(tmp_path)).capture(), KNOWN)
+    with pytest.raises(InputError, match=r"no picture below .*0a1b is called /home/user/p_0\.png\. Copy it there\."):
+        read(folder)
+    assert_known(OtherProgramReader(root=str(tmp_path), images="photos").capture(), KNOWN)
