@@ -20,6 +20,7 @@ from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.regular import contents, other_format
+from nerf_lightning.files.signatures import Signature, file_with
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
@@ -37,7 +38,11 @@ def readers() -> tuple[type[Reader], ...]:
     texts = (conf_file(f"scene/{name}").read_text(encoding="utf-8") for name in option_names("scene"))
     targets = (str(yaml.safe_load(text)["_target_"]).rpartition(".") for text in texts)
     classes = (getattr(importlib.import_module(module), name) for module, _, name in targets)
-    found = [each for each in classes if "found_in" in vars(each) and each not in FIRST]
+    found = [
+        each
+        for each in classes
+        if each not in FIRST and any("found_in" in vars(base) for base in each.__mro__ if base is not Reader)
+    ]
     return (*FIRST, *dict.fromkeys(found))
 
 
@@ -139,16 +144,16 @@ class AutoReader(CaptureReader):
         fitting = [reader for reader in readers() if path.suffix.lower() in reader.named_by]
         if not fitting or not os.path.isfile(path):
             return None
-        reader = next((each for each in fitting if each.found_in(path.parent) == path.name), fitting[-1])
+        likeliest = [each for each in fitting if each in FIRST] or fitting
+        known = (each for each in fitting if path.name in (each.found_in(path), each.found_in(path.parent)))
+        reader = next(known, likeliest[-1])
         return Known(self.folder(), path.name, reader)
 
     def _hint(self) -> str:
         """Say what program has written the folder, where that is clear, and how its captures are read."""
         folder = self.folder()
-        for files, words in OF_OTHERS:
-            if all(any(folder.glob(pattern)) for pattern in files):
-                return f" {words}"
-        return ""
+        fitting = (words for files, words in OF_OTHERS if all(file_with(folder, file) for file in files))
+        return next((f" {words}" for words in fitting), "")
 
     def _chosen(self) -> dict[str, Any]:
         """Return the settings that say something."""
@@ -156,27 +161,70 @@ class AutoReader(CaptureReader):
         return {name: value for name, (value, default) in values.items() if value != default}
 
 
-OF_OTHERS: tuple[tuple[tuple[str, ...], str], ...] = (
+OF_OTHERS: tuple[tuple[tuple[Signature, ...], str], ...] = (
     (
-        ("metadata.json", "rgb*"),
+        (("metadata.json", '"(perFrameIntrinsicCoeffs|poses|fps|K)"'), ("rgb*", "")),
         "It looks like an export of Record3D: convert it with nerfstudio (ns-process-data record3d), which writes a "
         "transforms.json.",
     ),
-    (("*.r3d",), "A .r3d file of Record3D is an archive: unpack it, and convert it with nerfstudio (ns-process-data)."),
     (
-        ("*.csv",),
-        "If the csv file is RealityScan's (RealityCapture's) list of cameras, export its COLMAP format instead.",
+        (("*.r3d", ""),),
+        "A .r3d file of Record3D is an archive: unpack it, and convert it with nerfstudio (ns-process-data).",
     ),
-    (("*.xmp",), "XMP files next to photographs are RealityScan's cameras: export its COLMAP format instead."),
     (
-        ("ARWorldMap*",),
+        (("*.csv", r"\A#?name,x,y,(alt|z),"),),
+        "It holds RealityScan's (RealityCapture's) list of cameras as csv: export its COLMAP format instead.",
+    ),
+    (
+        (("*.xmp", ""),),
+        "XMP files next to photographs are RealityScan's cameras: export its COLMAP format instead.",
+    ),
+    (
+        (("point_cloud", ""),),
+        "It looks like the output of 3DGS (Gaussian splats): read the capture that it was made of, whose folder "
+        "cfg_args names as source_path.",
+    ),
+    (
+        (("camera*.json", '"projection_type"'),),
+        "It holds cameras of OpenSfM or ODM, but not their poses: copy reconstruction.json there (of an ODM project, "
+        "opensfm/reconstruction.json).",
+    ),
+    (
+        (("*.mg", ""),),
+        "A .mg is a project of Meshroom: give the folder in MeshroomCache/StructureFromMotion that holds cameras.sfm.",
+    ),
+    (
+        (("*.nvm", r"\ANVM_V3"),),
+        "A .nvm is a model of VisualSFM: export it as a Bundler file (bundle.out and list.txt), or use nerf poses.",
+    ),
+    (
+        (("*.sens", ""),),
+        "A .sens is a recording of ScanNet: unpack it with ScanNet's SensReader (color, pose, intrinsic).",
+    ),
+    (
+        (("sfm_data*.bin", ""),),
+        "It holds openMVG's sfm_data.bin: convert it to sfm_data.json (openMVG_main_ConvertSfM_DataFormat).",
+    ),
+    (
+        (("*.abc", ""),),
+        "If the .abc file is Meshroom's, convert it to sfm.json (the node ConvertSfMFormat).",
+    ),
+    (
+        (("ARWorldMap*", ""),),
         "It looks like a recording of ARKit: convert it to a transforms.json (nerfstudio reads several such apps).",
     ),
-    (("*.json",), "A transforms.json under another name is read with scene=transforms scene.file=NAME."),
     (
-        ("*.psx",),
+        (("*.json", '"(transform_matrix|file_path)"'),),
+        "A transforms.json under another name is read with scene=transforms scene.file=NAME.",
+    ),
+    (
+        (("*.psx", ""),),
         "A .psx is a project of Metashape: export its cameras as Agisoft XML (File > Export > Export Cameras).",
     ),
-    (("*.glb", "*.zip"), "Kiri Engine's export for developers holds a transforms.json: unpack that one."),
+    ((("*.[gz][li][bp]", ""),), "Kiri Engine's export for developers holds a transforms.json: unpack that one."),
 )
-"""Files of formats that are not read, and what to do with them."""
+"""What captures of other programs that are not read are known by, and what to do with them.
+
+Each row: the signatures that a folder must have, all of them, and the words. Formats that an extension reads stand in
+its reader.
+"""

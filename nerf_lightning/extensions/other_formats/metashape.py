@@ -3,8 +3,11 @@
 import logging
 import math
 import os
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import torch
@@ -18,14 +21,14 @@ from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.signatures import file_with, files_with
 from nerf_lightning.files.xml_files import read_xml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
 from nerf_lightning.nerf.types.scene import LensModel
 
-HEAD = 4096
+SIGNATURE = ("*.xml", r"<document[\s\S]*<chunk")
 LENSES: dict[str, LensModel] = {"frame": "radial_tangential", "fisheye": "fisheye", "spherical": "equirectangular"}
 """By a sensor's type."""
 OFF = ("0", "false")
@@ -48,9 +51,25 @@ class Sensor:
     lens: tuple[float, float, float, float, float, float]
 
 
+class Aligned(NamedTuple):
+    """A camera, and the one whose transform it has: itself, or the master of its rig."""
+
+    label: str
+    camera: Element
+    posed: Element
+
+    @property
+    def component(self) -> str:
+        """Return the number of what was aligned together."""
+        return self.posed.get("component_id", "")
+
+
 @dataclass
 class MetashapeReader(CaptureReader):
     """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
+
+    Of several components, whose frames differ, the largest is read. Slaves of a rig have their master's pose times
+    their sensor's place in the rig.
 
     Args:
         file: the XML file below root; null: the only one there.
@@ -64,7 +83,7 @@ class MetashapeReader(CaptureReader):
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
         """Return the file by which this format is known, where a folder has it."""
-        return next((path.name for path in sorted(folder.glob("*.xml")) if _is_ours(path)), None)
+        return file_with(folder, SIGNATURE)
 
     def capture(self) -> Capture:
         """Return the aligned photographs, in the file's order."""
@@ -72,50 +91,44 @@ class MetashapeReader(CaptureReader):
         path = self._path(root)
         chunk = _chunk(path)
         left_out = LeftOut(str(path))
-        cameras = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("label")]
+        cameras = _named(chunk)
         require_within("views", len(cameras), path, "views")
-        aligned = [camera for camera in cameras if camera.findtext("transform") and camera.get("enabled") not in OFF]
-        labels = [str(camera.get("label")) for camera in cameras]
-        pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
         sensors = {each.get("id", ""): each for each in chunk.iterfind("sensors//sensor")}
+        component, aligned = _largest(list(_aligned(cameras)), chunk, path)
+        labels = [label for label, _ in cameras]
+        pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
         views, lenses = [], set[LensModel]()
-        for camera, label in ((camera, str(camera.get("label"))) for camera in aligned):
+        for label, camera, posed in aligned:
             with left_out.unless_usable(label):
                 if label not in pictures:
                     raise InputError(f"{path}: no picture below {root} is called {label}. Copy it there.")
-                sensor = _sensor(sensors.get(camera.get("sensor_id", "")), camera.get("sensor_id", ""), path)
-                views.append(_view(camera, label, sensor, pictures[label], path))
+                number = camera.get("sensor_id", "")
+                sensor = _sensor(sensors.get(number), number, path)
+                c2w = _matrix(posed, f"{path}: the transform of {label}", path)
+                if camera is not posed:
+                    c2w = c2w @ _place_in_rig(sensors[number], f"{path}: the sensor {number} of {label}", path)
+                views.append(_view(c2w[:3], label, sensor, pictures[label]))
                 lenses.add(sensor.lens_model)
         left_out.require_enough(len(views))
         if terms := sorted({each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and _number(each.text, path)}):
             log.warning("%s: the lens has %s, which is not supported and is left out", path, " and ".join(terms))
-        posed = {view.name for view in views} | left_out.faults.keys()
-        left_out.without_pose = tuple(label for label in labels if label not in posed)
-        lens_model = one_lens_model(lenses, path)
-        return Capture(tuple(views), path, lens_model, undo=_chunk_to_world(chunk, path), left_out=left_out)
+        known = {view.name for view in views} | left_out.faults.keys()
+        left_out.without_pose = tuple(label for label in labels if label not in known)
+        lens_model, undo = one_lens_model(lenses or {"pinhole"}, path), _to_world(component, path)
+        return Capture(tuple(views), path, lens_model, undo=undo, left_out=left_out)
 
     def _path(self, root: Path) -> Path:
         """Return the file that the user has named, or the only one."""
         named = Path(self.root).expanduser()
         if self.file is not None or os.path.isfile(named):
             return named if self.file is None else root / self.file
-        found = [path for path in sorted(root.glob("*.xml")) if _is_ours(path)]
+        found = [root / name for name in files_with(root, SIGNATURE)]
         if len(found) == 1:
             return found[0]
         if not found:
             raise InputError(f"{root} holds no xml of Metashape's cameras. Export them there, or set scene.file=NAME.")
         names = listed((path.name for path in found), 4)
         raise InputError(f"{root} holds {len(found)} files of Metashape's cameras ({names}). Give scene.root=FILE.")
-
-
-def _is_ours(path: Path) -> bool:
-    try:
-        with open_regular(path, None) as file:
-            start = file.read(HEAD)
-    except (OSError, InputError):
-        return False
-    start = start.replace(b"\0", b"")  # of UTF-16
-    return b"<document" in start and b"<chunk" in start
 
 
 def _chunk(path: Path) -> Element:
@@ -159,9 +172,7 @@ def _sensor(sensor: Element | None, number: str, path: Path) -> Sensor:
     return Sensor(LENSES[kind], (width, height), (f + b1, f), center, (k1, k2, k3, k4, p1, p2))
 
 
-def _view(camera: Element, label: str, sensor: Sensor, picture: Path, path: Path) -> View:
-    words = camera.findtext("transform", "").split()
-    c2w = pose_from_matrix(_numbers(words, path), f"{path}: the transform of {label}")
+def _view(c2w: Float[Tensor, "3 4"], label: str, sensor: Sensor, picture: Path) -> View:
     return View(
         name=label,
         photograph=Photograph(picture),
@@ -173,10 +184,64 @@ def _view(camera: Element, label: str, sensor: Sensor, picture: Path, path: Path
     )
 
 
-def _chunk_to_world(chunk: Element, path: Path) -> Float[Tensor, "4 4"]:
-    """Return what takes the chunk's frame to the world's, where the chunk is referenced."""
+def _named(chunk: Element) -> list[tuple[str, Element]]:
+    """Return the cameras with their labels, in order; those that are alike have their group's before."""
+    found = list[tuple[str, str, Element]]()
+    for each in chunk.iterfind("cameras/*"):
+        group = each.get("label") or "" if each.tag == "group" else ""
+        found += [(group, camera.get("label") or "", camera) for camera in each.iter("camera")]
+    counts = Counter(label for _, label, _ in found)
+    return [(f"{g}/{label}" if g and counts[label] > 1 else label, camera) for g, label, camera in found if label]
+
+
+def _aligned(cameras: list[tuple[str, Element]]) -> Iterator[Aligned]:
+    """Return the cameras that have a transform, or whose master has one."""
+    by_number = {camera.get("id"): camera for _, camera in cameras}
+    for label, camera in cameras:
+        posed = camera if camera.findtext("transform") else by_number.get(camera.get("master_id"))
+        if posed is not None and posed.findtext("transform") and camera.get("enabled") not in OFF:
+            yield Aligned(label, camera, posed)
+
+
+def _largest(aligned: list[Aligned], chunk: Element, path: Path) -> tuple[Element, list[Aligned]]:
+    """Return the component with most cameras, and these; the chunk stands for one without a transform."""
+    counts = Counter(each.component for each in aligned)
+    number = max(counts, key=counts.__getitem__, default="")
+    others = [each.label for each in aligned if each.component != number]
+    if others:
+        log.warning(
+            "%s: %d photographs of %d other components, whose frames differ, are left out: %s. To read them, merge the "
+            "components in Metashape, or export each alone",
+            *(path, len(others), len(counts) - 1, listed(others, 3)),
+        )
+    described = (each for each in chunk.iterfind("components/component") if each.get("id") == number)
+    component = next((each for each in described if each.find("transform") is not None), chunk)
+    return component, [each for each in aligned if each.component == number]
+
+
+def _place_in_rig(sensor: Element, where: str, path: Path) -> Float[Tensor, "4 4"]:
+    """Return a slave's camera to its master's, axes right, down, ahead."""
+    rotation, location = (sensor.findtext(key, "").split() for key in ("rotation", "location"))
+    if (len(rotation), len(location)) != (9, 3):
+        raise InputError(f"{where} has no rotation and location in its rig, so it has no pose. {CURE}")
+    rows = [word for row in range(3) for word in (*rotation[3 * row : 3 * row + 3], location[row])]
+    return _matrix_of(_numbers(rows, path), where)
+
+
+def _matrix(camera: Element, where: str, path: Path) -> Float[Tensor, "4 4"]:
+    return _matrix_of(_numbers(camera.findtext("transform", "").split(), path), where)
+
+
+def _matrix_of(numbers: list[float], where: str) -> Float[Tensor, "4 4"]:
     matrix = torch.eye(4, dtype=torch.float64)
-    transform = chunk.find("transform")
+    matrix[:3] = pose_from_matrix(numbers, where)
+    return matrix
+
+
+def _to_world(part: Element, path: Path) -> Float[Tensor, "4 4"]:
+    """Return what takes the frame of a component or a chunk to the world's, where it is referenced."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    transform = part.find("transform")
     if transform is None:
         return matrix
     rotation = _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), path)

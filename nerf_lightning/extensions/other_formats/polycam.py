@@ -9,6 +9,7 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.data.readers.frames import number_of
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import read_json
@@ -67,12 +68,13 @@ def _view(path: Path, picture: Path, depth: Path) -> View:
     if not isinstance(said, dict):
         raise InputError(f"{path} is not a JSON object with a pose. Export the capture again.")
     matrix = [[number_of(said, f"t_{row}{column}", str(path)) for column in range(4)] for row in range(3)]
-    fx, fy, cx, cy, width, height = (
-        number_of(said, key, str(path)) for key in ("fx", "fy", "cx", "cy", "width", "height")
-    )
+    fx, fy, cx, cy = (number_of(said, key, str(path)) for key in ("fx", "fy", "cx", "cy"))
+    header = read_header(picture)
+    stored = dict(zip(("width", "height"), map(float, header.size), strict=True))  # those refined lack them
+    width, height = (number_of(said, key, str(path), default) for key, default in stored.items())
     return View(
         name=picture.name,
-        photograph=Photograph(picture),
+        photograph=Photograph(picture, header=header),
         c2w=pose_from_matrix(matrix, str(path)),
         focal=(fx, fy),
         center=(cx, cy),

@@ -93,20 +93,20 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
         name = picture.name
         with left_out.unless_usable(prefix + name):
             pose, own = folder / "pose" / f"{stem}.txt", folder / "intrinsics" / f"{stem}.txt"
-            intrinsics = _numbers(own if own.is_file() else folder / "intrinsics.txt")
+            intrinsics = first_numbers(own if own.is_file() else folder / "intrinsics.txt")
             header = read_header(picture)
-            (fx, fy, cx, cy), size = _intrinsics(intrinsics, header.size)
+            (fx, fy, cx, cy), size = intrinsics_of(intrinsics, header.size)
             yield View(
                 name=prefix + name,
                 photograph=Photograph(picture, header=header),
-                c2w=flip_yz(pose_from_matrix(_numbers(pose)[:16], str(pose))),
+                c2w=flip_yz(pose_from_matrix(first_numbers(pose)[:16], str(pose))),
                 focal=(fx, fy),
                 center=(cx, cy),
                 size=size,
             )
 
 
-def _intrinsics(
+def intrinsics_of(
     numbers: list[float], size: tuple[int, int]
 ) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
     """Return fx, fy, cx, cy, and the (width, height) that they hold for: that of the picture where none is said.
@@ -125,8 +125,8 @@ def _intrinsics(
     return (numbers[0], numbers[0], numbers[1], numbers[2]), as_it_is
 
 
-def _numbers(path: Path) -> list[float]:
-    """Return the numbers at the beginning of a text file."""
+def first_numbers(path: Path) -> list[float]:
+    """Return the numbers with which a text file begins, at least three; lines that begin with # are left out."""
     found = list[float]()
     lines = [line for line in read_text(path, "text", CURE).splitlines() if not line.startswith("#")]
     for word in " ".join(lines).replace(",", " ").split():
@@ -143,7 +143,7 @@ def _box(root: Path) -> Float[Tensor, "2 3"] | None:
     """Return the corners that `bbox.txt` names, where it is there."""
     if not (root / "bbox.txt").is_file():
         return None
-    numbers = torch.tensor(_numbers(root / "bbox.txt")[:6], dtype=torch.float64)
+    numbers = torch.tensor(first_numbers(root / "bbox.txt")[:6], dtype=torch.float64)
     return (
         numbers.reshape(2, 3).sort(dim=0).values if len(numbers) == 6 and bool(torch.isfinite(numbers).all()) else None
     )

@@ -49,3 +49,39 @@ def test_a_folder_of_no_known_format_is_told_what_is_looked_for(tmp_path):
     write_npz(tmp_path / "tiny.npz")
     with pytest.raises(InputError, match=r"known format \(blender, .*\): it holds tiny\.npz.*scene=photos"):
         AutoReader(root=str(tmp_path)).read()
+
+
+HINTS = {
+    "Record3D": {"metadata.json": '{"K": [1], "poses": []}', "rgb/0.jpg": ""},
+    "A .r3d file of Record3D": {"a.r3d": ""},
+    "RealityScan's": {"cameras.csv": "#name,x,y,alt,heading,pitch,roll,f"},
+    "XMP files": {"0.xmp": ""},
+    "output of 3DGS": {"point_cloud/iteration_7/point_cloud.ply": ""},
+    "OpenSfM or ODM": {"cameras.json": '{"a": {"projection_type": "brown"}}'},
+    "project of Meshroom": {"a.mg": ""},
+    "VisualSFM": {"a.nvm": "NVM_V3 "},
+    "recording of ScanNet": {"scene0000_00.sens": ""},
+    "openMVG": {"sfm_data.bin": ""},
+    "Meshroom's": {"sfm.abc": ""},
+    "recording of ARKit": {"ARWorldMap.dat": ""},
+    "transforms.json under another name": {"a.json": '{"frames": [{"file_path": "a"}]}'},
+    "project of Metashape": {"a.psx": ""},
+    "Kiri": {"a.zip": ""},
+}
+
+
+@pytest.mark.parametrize("words", HINTS)
+def test_captures_of_other_programs_are_named_by_what_their_files_hold(tmp_path, words):
+    for name, text in HINTS[words].items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=words):
+        AutoReader(root=str(tmp_path)).read()
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.csv", "metadata.json"])
+def test_files_that_hold_something_else_are_no_hint(tmp_path, name):
+    (tmp_path / name).write_text('{"dataset": 1, "name": 2}')
+    (tmp_path / "rgb").mkdir()
+    with pytest.raises(InputError, match=r"it holds a?[\w.]+, rgb\. If these are photographs"):
+        AutoReader(root=str(tmp_path)).read()

@@ -5,8 +5,9 @@ import shutil
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
-from other_captures import write_metashape, write_nerfpp, write_neus, write_nsvf, write_polycam
+from other_captures import opencv_pose, write_metashape, write_nerfpp, write_neus, write_nsvf, write_polycam
 from support.other_formats import SPLIT_AT
 from support.plain_capture import (
     ALL,
@@ -47,11 +48,50 @@ RAW, OFF = partial(write_polycam, known=KNOWN, shift=5.0), r"photographs have no
 MATRIX, UNALIGNED = "20 0 8\n0 20 6\n0 0 1", without_3('label="p_3">')
 DISABLED = ms(lambda xml: xml.replace('label="p_3"', 'label="p_3" enabled="false"'))
 DAMAGED, SECOND = without_3('label="p_3"><transform>1 2</transform>'), partial(re.sub, "<chunk>", "<chunk/><chunk>")
+SIZES = rb', "width": 16, "height": 12'
+
+
+def slave(xml):
+    """Take the transform of p_3 away: it is the second camera of a rig, whose first is p_0."""
+    first, second = (opencv_pose(KNOWN, view) for view in (0, 3))
+    place = np.linalg.inv(first) @ second
+    rotation, location = (" ".join(map(str, part)) for part in (place[:3, :3].ravel().tolist(), place[:3, 3].tolist()))
+    (sensor,) = re.findall(r"<sensor id.*?</sensor>", xml)
+    other = sensor.replace('id="0"', 'id="1" master_id="0"').replace(
+        "</sensor>", f"<rotation>{rotation}</rotation><location>{location}</location></sensor>"
+    )
+    xml = re.sub(r'sensor_id="0" label="p_3">.*?</transform>', 'sensor_id="1" master_id="0" label="p_3">', xml)
+    return xml.replace(sensor, sensor + other)
+
+
+def in_components(xml):
+    second = '<component id="1"><transform><scale>9</scale></transform></component>'
+    xml = re.sub(r'label="p_([\d])"', lambda match: f'{match[0]} component_id="{int(match[1] == "3")}"', xml)
+    return xml.replace("<cameras>", f'<components><component id="0"/>{second}</components><cameras>')
+
+
+def equal_labels(xml):
+    xml = xml.replace('<group id="0">', '<group id="0" label="a">').replace("</group>", '</group><group label="b">')
+    return re.sub(r'label="p_4"(.*?</camera>)', r'label="p_0"\1</group>', xml)
+
+
+def moved_apart(root):
+    for group, old in (("a", "p_0.png"), ("b", "p_4.png")):
+        (root / "images" / group).mkdir()
+        (root / "images" / old).rename(root / "images" / group / "p_0.png")
+
+
 OTHERS = {
     "polycam": (write_polycam, None, ALL, r"scene=polycam"),
     "polycam corrected": (partial(write_polycam, kind="corrected_"), RAW, ALL, r"has keyframes/corrected_cameras"),
     "polycam, none corrected": (write_polycam, made("keyframes/corrected_cameras"), ALL, r"has keyframes/cameras"),
     "polycam absent": (write_polycam, gone("*/images/103.png"), WITHOUT_3, r"1 of 9 views .* 103\."),
+    "polycam without sizes": (
+        write_polycam,
+        lambda root: files(root, "*/cameras/*.json", lambda said: said.replace(SIZES, b"")),
+        ALL,
+        r"scene=polycam",
+    ),
     "neus": (write_neus, None, ALL, r"scene=neus"),
     "neus negative": (partial(write_neus, factor=-7.0), None, ALL, r"scene=neus"),
     "neus in rgb": (write_neus, renamed("image", "rgb"), ALL, r"scene=neus"),
@@ -66,6 +106,15 @@ OTHERS = {
     "metashape": (write_metashape, None, ALL, r"scene=metashape"),
     "metashape disabled": (DISABLED, None, WITHOUT_3, OFF),
     "metashape unaligned": (ms(UNALIGNED), None, WITHOUT_3, OFF),
+    "metashape's rig": (ms(slave), None, ALL, r"scene=metashape"),
+    "metashape's rig without a place": (
+        ms(lambda xml: re.sub("<location>.*</location>", "", slave(xml))),
+        None,
+        WITHOUT_3,
+        r"1 of 9 .* p_3\. .* has no rotation and location in its rig",
+    ),
+    "metashape's components": (ms(in_components), None, WITHOUT_3, r"1 photographs of 1 other components, .* p_3\."),
+    "metashape's equal labels": (ms(equal_labels), moved_apart, ALL, r"scene=metashape"),
     "metashape damaged": (ms(DAMAGED), None, WITHOUT_3, r"1 of 9 .* p_3\."),
     "metashape's second chunk": (ms(SECOND), None, ALL, r"scene=metashape"),
     "metashape's skew": (
