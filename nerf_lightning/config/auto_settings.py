@@ -31,6 +31,7 @@ TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and 32.09 dB with 1024 and 2^18.
 """
 
+LONGEST_SETTING, GPU_LONGEST = "scene.longest", 1600
 STEPS_SETTING = "model.levels.fine.sampler.num_steps"
 RAYS_SETTING = "model.subpixels"
 GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
@@ -56,6 +57,21 @@ GPU_BATCHES = {
 """About 2^18 samples a step, as instant-ngp takes: a GPU needs as long for a step of less, which it begins slowly."""
 
 log = logging.getLogger(__name__)
+
+
+def with_longest(
+    config: DictConfig, overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None
+) -> DictConfig:
+    """Return the config with the size of photographs that a GPU has time for, unless a person has typed one.
+
+    A run that is gone on with (`former`: its config) keeps its own.
+    """
+    begun = None if former is None else _number(former, LONGEST_SETTING)
+    if "longest" not in config.scene or LONGEST_SETTING in map(key_of, overrides) or not (begun or on_gpu):
+        return config
+    config = copy.deepcopy(config)
+    config.scene.longest = int(begun or GPU_LONGEST)
+    return config
 
 
 def takes_distances(choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene) -> bool:
@@ -85,7 +101,7 @@ def resolve_auto(
         InputError: a setting that is neither a value nor auto.
     """
     config = copy.deepcopy(config)
-    is_capture = scene.truth is None and scene.capture_of is None
+    is_capture = "root" in config.scene and scene.capture_of is None
     seconds = config.budget.seconds
     if seconds == AUTO:
         has_steps = config.trainer.max_steps is not None or config.trainer.max_epochs is not None
@@ -128,7 +144,7 @@ def fit_model(
         return config, choices
     suited = _for_scene(scene, overrides, on_gpu, seconds) if former is None else _as_begun(scene, overrides, former)
     fitted, picked = compose_config(command, [*overrides, *suited])
-    fitted.paths = config.paths
+    fitted.paths, fitted.scene = config.paths, config.scene
     return fitted, picked
 
 

@@ -15,8 +15,10 @@ from nerf_lightning.config.auto_settings import (
     GPU_BATCHES,
     RAYS_SETTING,
     STEPS_SETTING,
+    fit_model,
     resolve_auto,
     resolve_correction,
+    with_longest,
 )
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
@@ -204,10 +206,29 @@ def test_captures_are_examined_trained_for_minutes_and_reported():
     assert (photos.doctor, photos.final.report, photos.budget.seconds) == (True, True, 300)
     other, _ = chosen_for(PHOTOGRAPHS, "scene=colmap", "scene.root=a")
     assert (other.doctor, other.final.report, other.budget.seconds) == (True, True, 300)
-    built_in, _ = chosen_for(replace(PHOTOGRAPHS, truth=lambda view: None), "scene=bricks")
+    built_in, _ = chosen_for(PHOTOGRAPHS, "scene=bricks")
     assert (built_in.doctor, built_in.final.report) == (False, False)
     given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false")
     assert (given.doctor, given.final.report) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("on_gpu", "typed", "former", "longest"),
+    [
+        (False, (), None, 640),
+        (True, (), None, 1600),
+        (True, ("scene.longest=800",), None, 800),
+        (False, (), {"scene": {"longest": 1600}}, 1600),
+        (True, (), {"scene": {"longest": 640}}, 640),
+    ],
+)
+def test_photographs_are_as_large_as_the_device_has_time_for(on_gpu, typed, former, longest):
+    typed = ("scene=auto", "scene.root=a", *typed)
+    config = with_longest(compose_config("train", typed)[0], typed, on_gpu, former)
+    assert (config.scene.downscale, config.scene.longest) == ("auto", longest)
+    assert fit_model("train", config, {"model": "auto"}, typed, PHOTOGRAPHS, on_gpu)[0].scene.longest == longest
+    built_in = compose_config("train", ())[0]
+    assert with_longest(built_in, (), on_gpu, former) is built_in
 
 
 @pytest.mark.parametrize(

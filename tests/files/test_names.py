@@ -42,7 +42,8 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
     },
     "extensions": {
         *("keyframes / 'depth' / f'{path.stem}.png'", "folder / 'pose' / f'{stem}.txt'"),
-        "folder / 'intrinsics' / f'{stem}.txt'",
+        *("folder / 'intrinsics' / f'{stem}.txt'", "picture.with_name(picture.name.replace('frame', 'depth'))"),
+        "path.with_name(layout.depth.format(path.stem.removeprefix(before)))",
     },
     "files": {
         "path.with_name(f'.{path.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{path.suffix}')",

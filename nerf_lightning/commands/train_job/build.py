@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.doctor.check import Check
@@ -83,6 +83,7 @@ def assemble_job(
     for each in loggers.values() if ranks.is_first() else ():
         if isinstance(each, WeightsAndBiases):
             each.require_access()
+    asked = with_longest(asked, overrides, settings.device_type == "cuda", former)
     scene = build(asked.scene).read() if scene is None else scene
     post_training.require_film(scene)
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene

@@ -32,10 +32,8 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
-MOST_PIXELS = 640
-"""Of the longer side of photographs whose size the user leaves open."""
-MOST_AROUND = 2048
-"""The same of panoramas, whose pixels cover all directions."""
+OF_PANORAMAS = 3.2
+"""How many times as long as photographs panoramas may be, whose pixels cover all directions."""
 PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "train")
 """Folders within a capture, whose parent is meant where one of them is given."""
 DEEPEST, MOST_FOLDERS = 3, 1000
@@ -56,8 +54,10 @@ class CaptureReader(Reader):
 
     Args:
         root: the capture's folder.
-        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that their
-            longer side has at most 640 pixels, enough for a few minutes on a CPU.
+        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that they
+            are at most `longest`.
+        longest: pixels of the longer side for downscale=auto. 640 are enough for a few minutes on a CPU; nerf train
+            takes 1600 on a GPU.
         hold_every: the first and every k-th view after it are held out for evaluation, if the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
         masks: a folder below root with masks, named like their photographs (or with .png added, or instead of the
@@ -85,6 +85,7 @@ class CaptureReader(Reader):
 
     root: str
     downscale: int | Literal["auto"] = 1
+    longest: int = 640
     hold_every: int = 8
     frames: str | None = None
     masks: str | None = None
@@ -219,13 +220,16 @@ class CaptureReader(Reader):
         if self.downscale != "auto":
             return self.downscale
         longest = max(max(upright_size(view.photograph)) for view in capture.views)
-        factor = -(-longest // (MOST_AROUND if capture.lens_model == "equirectangular" else MOST_PIXELS))
-        log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
+        allowed = round(self.longest * (OF_PANORAMAS if capture.lens_model == "equirectangular" else 1.0))
+        factor = -(-longest // allowed)
+        if factor > 1:
+            log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=1 keeps them)", factor, longest)
         return factor
 
     def _check_settings(self) -> None:
         if self.downscale != "auto":
             check_step("downscale", self.downscale)
+        check_step("longest", self.longest)
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave no training views: give 2 or more.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})

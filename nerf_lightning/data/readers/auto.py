@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -72,6 +72,7 @@ class AutoReader(CaptureReader):
     """
 
     name: str = "auto"
+    downscale: int | Literal["auto"] = "auto"
     images: str | None = None
 
     def read(self) -> Scene:
@@ -102,9 +103,9 @@ class AutoReader(CaptureReader):
         known = self._search()
         root = self.root if known.folder == self.folder() else str(known.folder)
         log.info("%s: read as scene=%s, because it has %s", root, known.scene, known.file)
-        chosen = self._chosen() | {"root": self.root, "name": self.name}
-        if not issubclass(known.reader, CaptureReader) and chosen.get("downscale") == "auto":
-            del chosen["downscale"]  # of renderings, which are small
+        chosen = self._chosen() | {"root": self.root, "name": self.name, "downscale": self.downscale}
+        if not issubclass(known.reader, CaptureReader) and chosen["downscale"] == "auto":  # renderings, which are small
+            chosen = {name: value for name, value in chosen.items() if name not in ("downscale", "longest")}
         refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
         if refused:
             raise InputError(

@@ -5,7 +5,6 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.pixels.decoding import identity_of
@@ -39,7 +38,6 @@ class PhotosReader(AutoReader):
     name: str = "photos"
     video: str | None = None
     panoramas: Panoramas = "auto"
-    downscale: int | Literal["auto"] = "auto"
 
     def reader(self) -> Reader:
         """Find the cameras, unless they are known, and return the reader of what was found.
@@ -56,7 +54,7 @@ class PhotosReader(AutoReader):
             return super().reader()
         found = ranks.from_first(self._cameras)
         log.info("cameras: cached in %s (scene.cache_dir=DIR changes the folder)", found)
-        return ColmapReader(**self._chosen() | {"root": str(found), "name": self.name})
+        return ColmapReader(**self._chosen() | {"root": str(found), "name": self.name, "downscale": self.downscale})
 
     def _cameras(self) -> Path:
         """Return the folder of a capture, which is made where it is not there yet."""

@@ -23,6 +23,7 @@ from nerf_lightning.extensions.other_formats.posed import (
     numbers,
 )
 from nerf_lightning.files.json_files import mapping, read_json, read_json_object
+from nerf_lightning.files.made_folders import file_name
 from nerf_lightning.messages.errors import InputError
 
 FOLDERS = ("rgb/1x", "rgb/2x", "rgb/4x", "rgb/8x", "rgb/16x", "rgb")
@@ -60,9 +61,7 @@ def _suits(folder: Path) -> bool:
 
 
 def _posed(root: Path, name: str, where: str) -> Posed:
-    path = root / "camera" / f"{name}.json"
-    if "/" in name or "\\" in name:
-        raise InputError(f"{where} is {name}, which is no name of a file. Export it again.")
+    path = root / "camera" / file_name(name, ".json")
 
     def camera(_: Size) -> tuple[Pose, Intrinsics]:
         said, at = mapping(read_json(path)), str(path)

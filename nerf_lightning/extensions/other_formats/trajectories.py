@@ -25,6 +25,7 @@ from nerf_lightning.extensions.other_formats.posed import (
     numbers,
 )
 from nerf_lightning.files.json_files import mapping, read_json
+from nerf_lightning.files.made_folders import file_name
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -159,7 +160,7 @@ def _stray(reader: PosedReader, path: Path) -> Capture:
             fx, fy, cx, cy = (number(said, key, where, value) for key, value in defaults.items())
             return pose, Intrinsics((fx, fy), (cx, cy), size)
 
-        return Posed(str(said.get("frame")), where, camera, root / "depth" / f"{said.get('frame')}.png")
+        return Posed(str(said.get("frame")), where, camera, root / "depth" / file_name(str(said.get("frame")), ".png"))
 
     found = {f"line {index}": cells for index, cells in enumerate(rows, start=2) if "".join(cells).strip()}
     return reader.posed(path, found, posed, folder)

@@ -53,6 +53,7 @@ class Walk(CameraPath):
         return self.pinholes(level(keys[:, :, 3], -keys[:, :, 2], keys[:, :, 1], around.up), around)
 
 
+@disable_autocast
 def level(
     eyes: Float[Tensor, "keys 3"],
     ahead: Float[Tensor, "keys 3"],
@@ -67,6 +68,7 @@ def level(
     return torch.where(steep[..., None], others, level_ones)
 
 
+@disable_autocast
 def walking_order(poses: Float[Tensor, "views 3 4"], radius: float) -> Int[Tensor, "views"]:
     """Return the order in which to pass photographs: as they are, or from neighbor to neighbor.
 
