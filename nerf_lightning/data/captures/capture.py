@@ -38,7 +38,7 @@ class View:
     depth: Path | None = None
     """A gray picture of 16 bits, or an array of numpy's (.npy), of depths along the camera's axis; 0 is unknown."""
     depth_unit: float | None = None
-    """How long a unit of `depth` is, in units of the capture; None: as of all (`Capture.depth_unit`)."""
+    """How long a unit of `depth` is, in units of the capture; None: see `known_depths.depths_of_maps`."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ OF_A_SENSOR = 0.9
 """Certainty of a measured distance: sensors err by a hundredth."""
 MOST_OF_A_MAP = 4096
 """Pixels of a depth map that are taken, evenly spread."""
+LEVELS = 1000
+"""Of a sensor's levels, which are millimeters, in a unit of the capture."""
 STRETCH = 0.02
 """Of a depth map's sides, against the photograph's: of another shape it is another picture's."""
 
@@ -46,27 +48,29 @@ def known_depths(capture: Capture, cameras: Cameras) -> KnownDepths | None:
     if len(capture.tracks):
         found.append(depths_of_points(capture.points, capture.point_errors, capture.tracks, cameras))
     if any(view.depth is not None for view in capture.views):
-        units = [view.depth_unit or capture.depth_unit for view in capture.views]
-        found.append(depths_of_maps([view.depth for view in capture.views], units, cameras))
+        maps = [(view.depth, view.depth_unit) for view in capture.views]
+        found.append(depths_of_maps(maps, capture.depth_unit, cameras))
     every = concatenate(found) if found else None
     return every if every is not None and len(every) else None
 
 
-def depths_of_maps(maps: Sequence[Path | None], units: Sequence[float], cameras: Cameras) -> KnownDepths:
+def depths_of_maps(maps: Sequence[tuple[Path | None, float | None]], level: float, cameras: Cameras) -> KnownDepths:
     """Return distances that depth sensors measured; maps that cannot be used are left out and named.
 
     Args:
-        maps: one per view, of any size of the photograph's shape; None: there is none.
-        units: of each, the length of a level or of 1, in the units of the cameras.
+        maps: one per view, of any size of the photograph's shape (None: there is none), and its unit's length in the
+            units of the cameras; None: `level`, or 1000 of them where it holds lengths.
+        level: the length of a sensor's level, in the units of the cameras.
         cameras: at the size of the pixels.
     """
     found, odd = [KnownDepths(PixelIndex(*(torch.zeros(0, dtype=torch.int64),) * 3), *(torch.zeros(0),) * 2)], []
     zeros, turned = torch.zeros(len(maps)), replace(cameras, c2w=cameras.c2w.float())
-    for view, path in enumerate(maps):
+    for view, (path, unit) in enumerate(maps):
         if path is None:
             continue
         try:
-            depth = torch.from_numpy(read_depth(path))
+            stored, counts_levels = read_depth(path)
+            depth = torch.from_numpy(stored)
         except InputError as error:
             odd.append(str(error).split(". ")[0])
             continue
@@ -80,8 +84,10 @@ def depths_of_maps(maps: Sequence[Path | None], units: Sequence[float], cameras:
         pixels = PixelIndex(torch.full_like(x, view), column.long(), row.long())
         directions = rays_through_pixels(turned, pixels, zeros, zeros).directions
         ahead = -(directions @ cameras.c2w[view, :, 2].to(directions)).clamp(max=-1e-3)
-        distance = (units[view] * depth[y, x] / ahead).float()
-        found.append(KnownDepths(pixels, distance, torch.full_like(distance, OF_A_SENSOR)))
+        unit = unit or (level if counts_levels else LEVELS * level)
+        distance = (unit * depth[y, x].double() / ahead).float()
+        sound = distance.isfinite() & (distance > 0)
+        found.append(KnownDepths(pixels[sound], distance[sound], torch.full_like(distance[sound], OF_A_SENSOR)))
     if odd:
         log.warning("%d depth maps are left out: %s", len(odd), listed(odd, 3))
     return concatenate(found)

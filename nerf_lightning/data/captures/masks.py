@@ -7,11 +7,16 @@ from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
+from nerf_lightning.data.pixels.decoding import of_one_shape
+from nerf_lightning.data.pixels.images import image_size, read_header, read_mask
 from nerf_lightning.files.regular import contents
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 
 FOLDERS = ("masks", "mask")
+MOST_READ = 4
+"""Masks of a folder that nothing names, which are read to see whether they are masks."""
 NO_MASKS = "none"
 
 log = logging.getLogger(__name__)
@@ -33,7 +38,7 @@ def with_masks(capture: Capture, masks: str | None, folders: Sequence[Path], kee
     found = {view.name: view.photograph.mask for view in capture.views if view.photograph.mask is not None}
     if masks == NO_MASKS:
         found = {}
-    elif masks is not None:
+    elif masks:
         folder = next((path for each in folders if (path := each / masks).is_dir()), folders[-1] / masks)
         named = _masks_in(folder, capture)
         if not named:
@@ -65,20 +70,41 @@ def _masks_beside(folders: Sequence[Path], capture: Capture) -> dict[str, Path]:
     for folder in dict.fromkeys(each / name for each in folders for name in FOLDERS):
         if not folder.is_dir() or not pictures_below(folder):
             continue
-        found, views = _masks_in(folder, capture), len(capture.views)
-        if len(found) == views:
+        found, fault = _suitable(folder, capture)
+        if found and not fault:
             log.info(
                 "%s: %s has a mask for each photograph, which is used (scene.masks=none does without; "
                 "scene.masks=%s names the folder)",
                 *(capture.source, folder, folder.name),
             )
             return found
-        if found:
+        if fault:
             log.warning(
-                "%s: %s has masks for %d of %d photographs and is not used; scene.masks=%s uses it",
-                *(capture.source, folder, len(found), views, folder.name),
+                "%s: %s is not used, because %s; scene.masks=%s uses it", capture.source, folder, fault, folder.name
             )
     return {}
+
+
+def _suitable(folder: Path, capture: Capture) -> tuple[dict[str, Path], str | None]:
+    """Return the masks that a folder has, and why they do not suit all photographs, if they do not.
+
+    All sizes are compared, and a few masks are read.
+    """
+    try:
+        found = _masks_in(folder, capture)
+        if 0 < len(found) < len(capture.views):
+            return found, f"it has masks for {len(found)} of {len(capture.views)} photographs"
+        for view in capture.views if found else ():
+            header = view.photograph.header or read_header(view.photograph.path)
+            if not any(of_one_shape(image_size(found[view.name]), size) for size in (header.size, header.size[::-1])):
+                return found, f"{found[view.name].name} has another shape than its photograph"
+        paths = list(found.values())
+        for number in evenly_spaced_subset(range(len(paths)), MOST_READ):
+            if not read_mask(paths[number]).any():
+                return found, f"{paths[number].name} keeps nothing"
+    except InputError as error:
+        return {}, str(error).split(". ")[0]
+    return found, None
 
 
 def _masks_in(folder: Path, capture: Capture) -> dict[str, Path]:

@@ -5,7 +5,6 @@ ending than what is there. All names of a file are changed in the same way: so m
 beginning, and the rest lies in one folder of the capture.
 """
 
-import glob
 import logging
 import os
 import re
@@ -26,6 +25,24 @@ PICTURE_FOLDERS = ("images", "image", "rgb", "input", "", "images_2", "images_4"
 """Where photographs lie below a capture's folder, the likeliest first."""
 JPEG = (".jpg", ".jpeg")
 KNOWN_ENDINGS = (*ENDINGS, *UNREAD, ".bmp")
+NOT_READ = (
+    *UNREAD,
+    ".gif",
+    ".bmp",
+    ".tga",
+    ".psd",
+    ".hdr",
+    ".ppm",
+    ".pnm",
+    ".svg",
+    ".jp2",
+    ".jxl",
+    ".mp4",
+    ".mov",
+    ".zip",
+)
+"""Endings under which a picture may lie that is not read."""
+CONVERT = "Files of this format are not read: convert all of them to PNG."
 SPLIT_FOLDERS = ("train", "val", "test", "eval")
 """Names that tell pictures apart which are called alike: they are never dropped, nor taken for each other."""
 BESIDE_PHOTOGRAPHS = re.compile(r"(masks?|depths?|normals?|segmentations?|semantics?|confidence)(_.*)?")
@@ -100,8 +117,8 @@ def find_pictures(
     if len(same) > 1:
         raise InputError(
             f"{source} names pictures such as {names[0]}, which match files of {listed(rule.folder for rule in same)} "
-            f"equally well. Move all but one of these folders out of {root} (or choose one with scene=colmap "
-            "scene.images=FOLDER)."
+            f"equally well. Move all but one of these folders out of {root}, or choose one with "
+            f"{'scene=colmap scene.images=FOLDER' if beside is None else 'scene.masks=FOLDER'}."
         )
     found = rules[best]
     name, path = next(iter(found.items()))
@@ -187,11 +204,12 @@ def why_absent(name: str, folder: Path, root: Path) -> str:
             f"{name} is an absolute path of another machine, and no picture below {root} matches its end. Copy the "
             "pictures there, or set scene.images to their folder (scene=colmap)."
         )
-    named = folder / name.replace("\\", "/")
-    for path in sorted(named.parent.glob(f"{glob.escape(named.stem)}.*")) if named.name else ():
-        cure = UNREAD.get(path.suffix.lower(), "Pictures of this format are not read: convert all of them to PNG.")
-        if path.suffix.lower() not in ENDINGS:
-            return f"the image {named} does not exist, but {path.name} does. {cure}"
+    named = Path(os.path.abspath(folder / name.replace("\\", "/")))
+    if any(named.is_relative_to(os.path.abspath(each)) for each in (root, folder)):
+        for path in (named.with_suffix(cased) for ending in NOT_READ for cased in (ending, ending.upper())):
+            if os.path.lexists(path):
+                cure = UNREAD.get(path.suffix.lower(), CONVERT)
+                return f"the image {named} does not exist, but {path.name} does. {cure}"
     return (
         f"the image {named} does not exist, and neither does one with another extension. Copy it there, or remove it "
         "from the capture's list."

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import threading
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
@@ -13,11 +14,14 @@ from nerf_lightning.messages.escaping import for_terminal
 
 ROUNDING = 2
 """Levels of 255 by which a profile may differ from sRGB and count as sRGB."""
+MOST_BYTES = 1 << 22
+"""Of a profile; those of screens and cameras have some kilobytes, and of printers a megabyte."""
 LEVELS = np.linspace(0, 255, 9).round().astype(np.uint8)
 MODES = {"1": "L", "L": "L", "LA": "L", "P": "RGB", "PA": "RGB", "RGB": "RGB", "RGBA": "RGB", "CMYK": "CMYK"}
 """The mode that profiles are about, by that of the picture."""
 
 log = logging.getLogger(__name__)
+_saying = threading.Lock()
 
 
 def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.Image]:
@@ -30,7 +34,8 @@ def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.I
         folder: where it lies, for the message.
     """
     profile, mode = image.info.get("icc_profile"), MODES.get(image.mode)
-    name, transform = _transform(profile, mode) if profile and mode else ("", None)
+    is_known = mode is not None and isinstance(profile, bytes) and 0 < len(profile) <= MOST_BYTES
+    name, transform = _transform(profile, mode) if is_known else ("", None)
     if transform is None or mode is None:
         if image.mode == "CMYK":
             _say(folder, "CMYK colors without a usable profile are converted to sRGB approximately")
@@ -47,13 +52,13 @@ def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.I
     return convert
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _transform(profile: bytes, mode: str) -> tuple[str, ImageCms.ImageCmsTransform | None]:
     """Return a profile's name, and what takes its colors to sRGB; None where it is sRGB, damaged, or of other modes."""
     try:
         known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         transform = ImageCms.buildTransform(known, ImageCms.createProfile("sRGB"), mode, "RGB")
-        samples = Image.fromarray(_lattice(len(mode) if mode != "L" else 1), mode)
+        samples = Image.fromarray(_lattice(len(mode)), mode)
         changed = np.asarray(ImageCms.applyTransform(samples, transform)).astype(int)
         name = ImageCms.getProfileDescription(known).strip()
     except (ImageCms.PyCMSError, OSError, ValueError):
@@ -67,6 +72,11 @@ def _lattice(channels: int) -> np.ndarray:
     return colors[..., 0] if channels == 1 else colors
 
 
-@cache
 def _say(folder: Path, what: str) -> None:
+    with _saying:  # pictures are read by several threads
+        _say_once(folder, what)
+
+
+@cache
+def _say_once(folder: Path, what: str) -> None:
     log.info("%s: %s", for_terminal(str(folder)), what)

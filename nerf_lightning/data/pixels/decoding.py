@@ -188,7 +188,7 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
         path, mask = photographs[index].path, photographs[index].mask
         width, height = upright_size(photographs[index])
         sizes = ((width, height), (height, width)) if photographs[index].upright else ((width, height),)
-        if mask is not None and not any(_of_one_shape(image_size(mask), size) for size in sizes):
+        if mask is not None and not any(of_one_shape(image_size(mask), size) for size in sizes):
             across, down = image_size(mask)
             raise InputError(
                 f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}, "
@@ -199,12 +199,12 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
     return each_or_faults(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
 
 
-def _of_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def of_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two sizes are the same, or one is the other resized; nearly the same is cropped."""
     (width, height), (across, down) = size, other
     rounding = 0.5 * max(width + height, across + down)
     resized = not LEAST_RESIZED < width / across < 1 / LEAST_RESIZED
-    return size == other or (resized and abs(width * down - height * across) <= rounding)
+    return size == other or (resized and abs(width * down - height * across) <= min(rounding, 0.1 * height * across))
 
 
 def _mask(
@@ -214,12 +214,12 @@ def _mask(
     kept = np.ones((height, width), dtype=np.bool_)
     if photograph.mask is not None:
         kept = _mask_of(photograph, photograph.mask, (width, height))
-        if not _of_one_shape((kept.shape[1], kept.shape[0]), (width, height)):
+        if not of_one_shape((kept.shape[1], kept.shape[0]), (width, height)):
             _check_unchanged(kept, (width, height), photograph.mask)
         kept = _resized(kept, (width, height))
     if photograph.radius is not None:
         y, x = (np.arange(side) + 0.5 - side / 2 for side in kept.shape)
-        kept = kept & (x * x + y[:, None] ** 2 <= photograph.radius**2)
+        kept = kept & (np.hypot(x, y[:, None]) <= photograph.radius)
     kept = whole_blocks(kept, downscale)
     _check_unchanged(kept, size, photograph.mask or photograph.path)
     if not kept.any():
@@ -234,7 +234,7 @@ def _mask(
 def _mask_of(photograph: Photograph, mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
     """Return a photograph's mask at its own size, turned as the photograph is (`size`)."""
     header = read_header(mask)
-    as_shown = photograph.upright and not _of_one_shape(header.size, size)
+    as_shown = photograph.upright and not of_one_shape(header.size, size)
     kept = read_mask(mask, photograph.mask_keeps or "white", as_shown)
     if as_shown and header.orientation == 1:  # programs that make masks may drop the tag
         kept = TURNED[read_header(photograph.path).orientation](kept)

@@ -139,8 +139,9 @@ def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -
         convert = to_srgb(image, path.parent) if converts_colors else lambda part: part.convert("RGBA")
         for rows in row_chunks(*rgba.shape[:2]):  # several copies of the whole would be held at once
             part = image.crop((0, rows.start, image.width, rows.stop))
-            if part.mode in GREY_16:
-                part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))
+            if part.mode in GREY_16:  # of masks, whose numbers count, the levels above 255 are white
+                levels = np.asarray(part)
+                part = Image.fromarray((levels >> 8 if converts_colors else levels.clip(max=255)).astype(np.uint8))
             rgba[rows] = np.asarray(convert(part))
         return rgba
 
@@ -155,10 +156,11 @@ def _say_reduced(folder: Path) -> None:
     log.info("%s: pictures with 16 bits per channel are read with the upper 8", folder)
 
 
-def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
-    """Return a depth map as it is stored: a gray picture of 16 bits, as sensors write it, or an array (.npy).
+def read_depth(path: Path) -> tuple[Float32[np.ndarray, "height width"], bool]:
+    """Return a depth map as it is stored, and whether it counts levels, as sensors do, and not lengths.
 
-    What is no depth is 0: NaN, infinity and numbers below.
+    It is a gray picture of 16 bits, or an array (.npy), whose whole numbers are levels. What is no depth is 0: NaN,
+    infinity and numbers below.
 
     Raises:
         InputError: what `read_header` refuses, damaged, or of another kind.
@@ -167,13 +169,14 @@ def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
         depth = np.squeeze(read_npy(path, CURE))
         if depth.ndim != 2 or depth.dtype.kind not in "fiu" or not depth.size:
             raise InputError(f"The depth map {path} is not an array of numbers, height by width. Save it again.")
-        depth = depth.astype(np.float32)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        with np.errstate(over="ignore"):
+            lengths = depth.astype(np.float32)
+        return np.where(np.isfinite(lengths) & (lengths > 0), lengths, np.float32(0)), depth.dtype.kind != "f"
     with opened_picture(path) as image:
         if image.mode not in GREY_16:
             raise InputError(f"The depth map {path} is not a 16-bit grayscale picture. Save it as a 16-bit PNG.")
         try:
-            return np.asarray(image).astype(np.float32)
+            return np.asarray(image).astype(np.float32), True
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
 

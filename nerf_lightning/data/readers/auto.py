@@ -222,7 +222,8 @@ OF_OTHERS: tuple[tuple[tuple[Signature, ...], str], ...] = (
         (("*.psx", ""),),
         "A .psx is a project of Metashape: export its cameras as Agisoft XML (File > Export > Export Cameras).",
     ),
-    ((("*.[gz][li][bp]", ""),), "Kiri Engine's export for developers holds a transforms.json: unpack that one."),
+    ((("*.zip", ""),), "A zip archive is not read: unpack it, and give what it holds."),
+    ((("*.glb", ""),), "A .glb is a finished model: give the photographs, or an export of its cameras."),
 )
 """What captures of other programs that are not read are known by, and what to do with them.
 

@@ -128,8 +128,8 @@ class ColmapReader(CaptureReader):
         lenses = [LAYOUTS[model.cameras[image.camera].model][0] for image in kept]
         taken = set(files.values())
         base = os.path.commonpath([path.parent for path in taken])
-        others = [path for path in pictures_below(Path(base)) if path not in taken]
-        left_out.without_pose = tuple(path.relative_to(base).as_posix() for path in others) if self._own(base) else ()
+        others = [path for path in pictures_below(Path(base)) if path not in taken] if self._own(base) else []
+        left_out.without_pose = tuple(path.relative_to(base).as_posix() for path in others)
         capture = Capture(
             views=tuple(views),
             source=folder,
@@ -142,7 +142,7 @@ class ColmapReader(CaptureReader):
 
     def _own(self, folder: str) -> bool:
         """Tell whether a folder is one of photographs, and not one that holds all kinds of pictures."""
-        return Path(folder) != self.folder()
+        return Path(folder) not in (self.folder(), self.top()) and Path(folder).is_relative_to(self.top())
 
     def _model(self, root: Path) -> Path:
         if self.model is not None:
@@ -275,7 +275,7 @@ def _points(path: Path, ply: Path) -> ColmapPoints:
     """Return the sparse points of a model, or of the PLY file that 3DGS writes; none where they cannot be read."""
     try:
         with reading(path, "They are not needed for training."):
-            if path.exists():
+            if os.path.lexists(path):
                 return KINDS[path.suffix].points(path)
             if ply.is_file():
                 return read_ply_points(ply)

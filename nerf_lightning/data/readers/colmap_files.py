@@ -188,7 +188,7 @@ class _Bytes:
             return name.decode("utf-8")
         except UnicodeDecodeError:
             _say_of_encoding(self.path)
-            return name.decode(WINDOWS)
+            return name.decode(WINDOWS, "replace")
 
     def end(self) -> None:
         if self.place != len(self.data):

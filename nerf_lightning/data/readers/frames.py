@@ -6,6 +6,7 @@ here is numbers; whether they make a camera is judged by `captures.checks`.
 
 import logging
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,7 @@ from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.types.scene import LensModel
 
 LENSES: dict[str, LensModel] = {
@@ -41,7 +43,7 @@ LENSES: dict[str, LensModel] = {
     "EQUIRECTANGULAR": "equirectangular",
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-OF_OTHERS = ("ftheta_p0", "latlong", "equirectangular")
+UNREAD_LENSES = ("ftheta_p0", "latlong", "equirectangular")
 """Keys of instant-ngp's lenses that are not read."""
 ANGLES = {"camera_angle_": (math.pi, "pi radians"), "_fov": (180.0, "180 degrees")}
 """What a field of view is below, by its key."""
@@ -146,9 +148,9 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
         name=picture.relative_to(folder if picture.is_relative_to(folder) else picture.anchor).as_posix(),
         photograph=Photograph(
             picture,
-            mask=dynamic if dynamic.is_file() else None,
-            mask_keeps="black" if dynamic.is_file() else None,
-            radius=_radius(settings, stored_width / width, where),
+            mask=dynamic if os.path.isfile(dynamic) else None,
+            mask_keeps="black" if os.path.isfile(dynamic) else None,
+            radius=_radius(settings, stored_width, width, where),
             transparent=next((level for key, level in TRANSPARENT.items() if settings.get(key) is True), None),
             header=header,
         ),
@@ -161,11 +163,12 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
     return FoundFrame(name, settings, view, lens_model)
 
 
-def _radius(settings: dict[str, Any], scale: float, where: str) -> float | None:
+def _radius(settings: dict[str, Any], stored_width: float, width: float, where: str) -> float | None:
     """Return the circle of a fisheye that counts (nerfstudio), in pixels of the picture that is there."""
     if not settings.get("fisheye_crop_radius"):
         return None
-    return scale * positive_of(settings, "fisheye_crop_radius", where)
+    radius = positive_of(settings, "fisheye_crop_radius", where)
+    return radius * stored_width / width if width > 0 else None
 
 
 def path_of(name: object, key: str, where: str) -> str:
@@ -192,6 +195,14 @@ def positive_of(settings: dict[str, Any], key: str, where: str, default: float |
     value = number_of(settings, key, where, default)
     if not 0 < value < math.inf:
         raise InputError(f"{where}: {key} is {value:g}, but it must be above 0. Fix it, or remove it.")
+    return value
+
+
+def length_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """Return a number that lengths are multiplied by; `InputError` refuses one that is no scale of a capture's."""
+    value = positive_of(settings, key, where, default)
+    if not LEAST_UNIT <= value <= LARGEST_UNIT:
+        raise InputError(f"{where}: {key} is {value:g}, which is no scale. Fix it, or remove it.")
     return value
 
 
@@ -244,10 +255,11 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     k1, k2, k3, k4, p1, p2 = (number_of(settings, key, where, 0.0) for key in COEFFICIENTS)
     lens = (k1, k2, k3, k4, p1, p2)
     model = settings.get("camera_model", "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV")
-    other = next((key for key in OF_OTHERS if settings.get(key)), None)
+    other = next((key for key in UNREAD_LENSES if settings.get(key)), None)
     if other is not None:
         raise InputError(f"{where} has {other}, a lens of instant-ngp that is not supported. Use perspective pictures.")
-    kind = LENSES.get(model.strip().upper()) if isinstance(model, str) else None
+    model = model.strip().upper() if isinstance(model, str) else model
+    kind = LENSES.get(model) if isinstance(model, str) else None
     if kind is None:
         raise InputError(
             f"{where} has the camera_model {model!r}; supported are {listed(LENSES, len(LENSES))}. Undistort the "
@@ -256,7 +268,7 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     if kind in ("pinhole", "equirectangular") and any(lens):
         raise InputError(f"{where} has the camera_model {model} and distortion coefficients. Remove one of them.")
     # The radial distortion is divided by 1 + k4 r^2 + k5 r^4 + k6 r^6; without k5 and k6, k4 is nerfstudio's r^8.
-    divided = ("k4", "k5", "k6") if str(model).upper() == "FULL_OPENCV" else ("k5", "k6")
+    divided = ("k4", "k5", "k6") if model == "FULL_OPENCV" else ("k5", "k6")
     if kind == "radial_tangential" and any(number_of(settings, key, where, 0.0) for key in divided):
         raise InputError(
             f"{where} has the camera_model {model} with {listed(divided)}, which divide the distortion (a rational "

@@ -18,6 +18,7 @@ from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.readers.frames import (
     FoundFrame,
     FrameFile,
+    length_of,
     number_of,
     path_of,
     positive_of,
@@ -82,6 +83,7 @@ class TransformsReader(CaptureReader):
             undo=undo,
             box=next((box for file in files if (box := _ngp_box(file.content, str(file.path))) is not None), None),
             left_out=left_out,
+            depth_unit=1e-3 / unit_of(undo),
         )
         return of_one_lens(capture, [frame.lens_model for frame in found])
 
@@ -115,17 +117,28 @@ class TransformsReader(CaptureReader):
         masks, depths, others = (
             self._files_of(path, found, key) for key in ("mask_path", "depth_file_path", "depth_path")
         )
-        views = []
+        views, fault = [], ""
         for each, mask, depth, other in zip(found, masks, depths, others, strict=True):
-            units = [positive_of(each.settings, key, str(path)) for key in DEPTH_UNITS if key in each.settings]
-            unit, photograph = self.depth_unit or next(iter(units), None), each.view.photograph
+            photograph, depth = each.view.photograph, depth or other
             if mask is not None:
                 photograph = replace(photograph, mask=mask, mask_keeps=None)
-            depth = depth or other
-            if depth is not None and unit is None:
-                unit = 1.0 if depth.suffix == ".npy" else 1e-3
-            views.append(replace(each.view, photograph=photograph, depth=depth, depth_unit=scale * (unit or 1.0)))
+            unit = None
+            try:
+                unit = None if depth is None else self._depth_unit(each, path)
+            except InputError as error:
+                depth, fault = None, str(error)
+            unit = None if unit is None else scale * unit
+            views.append(replace(each.view, photograph=photograph, depth=depth, depth_unit=unit))
+        if fault:
+            log.warning("Depth maps are left out: %s", fault)
         return views
+
+    def _depth_unit(self, frame: FoundFrame, path: Path) -> float | None:
+        """Return the length of a unit of a frame's depth map, as the user or the file says; None where neither does."""
+        if self.depth_unit is not None:
+            return self.depth_unit
+        key = next((key for key in DEPTH_UNITS if key in frame.settings), None)
+        return None if key is None else length_of(frame.settings, key, str(path))
 
     def _files_of(self, path: Path, found: list[FoundFrame], key: str) -> list[Path | None]:
         """Return the file that each frame names by a key; those that are not there are named, and their frames stay."""
@@ -285,5 +298,5 @@ def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
                 f"{where}: applied_transform must be a rotation, a shift and the same scale along all axes. Fix it, or "
                 "remove it."
             )
-    applied[:3] *= positive_of(content, "applied_scale", where, 1.0)
+    applied[:3] *= length_of(content, "applied_scale", where, 1.0)
     return torch.linalg.inv(applied)

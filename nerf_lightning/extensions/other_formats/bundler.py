@@ -27,8 +27,8 @@ from nerf_lightning.messages.errors import InputError
 CURE = "Export it again."
 LISTS = ("list.txt", "*list*.txt", "*.txt")
 """Of the pictures, the likeliest first."""
-FOCAL_BEHIND = re.compile(r"\s+0(\s+[-+.\deE]+)?$")
-"""What may follow a name in such a list."""
+FOCAL = re.compile(r"[-+.\deE]+")
+"""What may follow a name and 0 in such a list."""
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
@@ -59,7 +59,15 @@ def _names(path: Path) -> list[str]:
     if found is None:
         raise InputError(f"{path} of Bundler needs a list of its pictures beside it, such as list.txt.")
     lines = read_text(path.parent / found, "text", CURE).splitlines()
-    return [FOCAL_BEHIND.sub("", line.strip()) for line in lines if line.strip()]
+    return [_name(line.strip()) for line in lines if line.strip()]
+
+
+def _name(line: str) -> str:
+    """Return the name of a picture in a line of a list, without a 0 and a focal length behind it."""
+    words = line.rsplit(maxsplit=2)
+    if len(words) == 3 and words[1] == "0" and FOCAL.fullmatch(words[2]):
+        return words[0]
+    return line.rsplit(maxsplit=1)[0] if len(words) > 1 and words[-1] == "0" else line
 
 
 def _numbers(lines: Iterator[str], rows: int, count: int, path: Path) -> list[float]:

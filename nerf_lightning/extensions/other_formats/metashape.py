@@ -25,10 +25,11 @@ from nerf_lightning.files.signatures import file_with, files_with
 from nerf_lightning.files.xml_files import read_xml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
 from nerf_lightning.nerf.types.scene import LensModel
 
-SIGNATURE = ("*.xml", r"<document[\s\S]*<chunk")
+SIGNATURE = ("*.xml", r"\A(?=[\s\S]*?<document)[\s\S]*?<chunk")
 LENSES: dict[str, LensModel] = {"frame": "radial_tangential", "fisheye": "fisheye", "spherical": "equirectangular"}
 """By a sensor's type."""
 OFF = ("0", "false")
@@ -110,7 +111,9 @@ class MetashapeReader(CaptureReader):
                 views.append(_view(c2w[:3], label, sensor, pictures[label]))
                 lenses.add(sensor.lens_model)
         left_out.require_enough(len(views))
-        if terms := sorted({each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and _number(each.text, path)}):
+        if terms := sorted(
+            {each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and (each.text or "0").strip(" 0.")}
+        ):
             log.warning("%s: the lens has %s, which is not supported and is left out", path, " and ".join(terms))
         known = {view.name for view in views} | left_out.faults.keys()
         left_out.without_pose = tuple(label for label in labels if label not in known)
@@ -249,7 +252,7 @@ def _to_world(part: Element, path: Path) -> Float[Tensor, "4 4"]:
     scale = _number(transform.findtext("scale", "1"), path)
     if (len(rotation), len(shift)) == (9, 3):
         matrix[:3] = torch.cat([matrix.new_tensor(rotation).reshape(3, 3), matrix.new_tensor(shift)[:, None]], dim=1)
-    if (len(rotation), len(shift)) != (9, 3) or not is_rigid(matrix[:3]):
+    if (len(rotation), len(shift)) != (9, 3) or not is_rigid(matrix[:3]) or not LEAST_UNIT <= scale <= LARGEST_UNIT:
         raise InputError(f"{path}: the chunk's transform is not a rotation, a shift and a scale. {CURE}")
     matrix[:3, :3] *= scale
     return matrix

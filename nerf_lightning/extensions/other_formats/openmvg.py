@@ -44,16 +44,16 @@ def _read(reader: PosedReader, path: Path) -> Capture:
     if not poses:
         raise InputError(f"{where} has no poses (extrinsics): take the file that the reconstruction has written.")
     views = {f"views {key}": _data(value) for key, value in _by_key(content, "views", where).items()}
-    posed = {place: view for place, view in views.items() if view.get("id_pose") in poses}
+    posed = {place: view for place, view in views.items() if str(view.get("id_pose")) in poses}
 
     def picture(view: dict[str, Any], where: str) -> Posed:
         name = path_of(view.get("filename"), "filename", where)
-        folder, intrinsic = view.get("local_path") or "", view.get("id_intrinsic")
+        folder, intrinsic = view.get("local_path") or "", str(view.get("id_intrinsic"))
 
         def camera(_: Size) -> tuple[Pose, Intrinsics]:
             if intrinsic not in cameras:
                 raise InputError(f"{where} has id_intrinsic {intrinsic}, which is not among the intrinsics.")
-            pose = mapping(poses[view["id_pose"]])
+            pose = mapping(poses[str(view["id_pose"])])
             rotation = numbers(pose.get("rotation"), 9, f"{where}: rotation")
             center = numbers(pose.get("center"), 3, f"{where}: center")
             said, kind = cameras[intrinsic]
@@ -73,7 +73,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 def _by_key(content: object, name: str, where: str) -> dict[Any, Any]:
     """Return a map as cereal writes it: a list of key and value."""
     items = [item for item in entries(content, name, where) if isinstance(item, dict)]
-    return {item["key"]: item.get("value") for item in items if isinstance(item.get("key"), (int, str))}
+    return {str(item["key"]): item.get("value") for item in items if isinstance(item.get("key"), (int, str))}
 
 
 def _data(value: object) -> dict[str, Any]:

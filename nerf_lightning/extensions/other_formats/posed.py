@@ -130,7 +130,7 @@ class PosedReader(CaptureReader):
                         center=camera.center,
                         size=camera.size,
                         lens=camera.lens,
-                        depth=each.depth if each.depth is not None and each.depth.is_file() else None,
+                        depth=each.depth if each.depth is not None and os.path.isfile(each.depth) else None,
                     )
                 )
                 is_plain = camera.lens_model == "radial_tangential" and not any(camera.lens)

@@ -71,7 +71,7 @@ def _replica(reader: PosedReader, path: Path) -> Capture:
     lines = list(_lines(path).values())
 
     def posed(picture: Path, where: str) -> Posed:
-        index = int("".join(filter(str.isdigit, picture.stem)) or -1)
+        index = int("".join(filter(str.isdecimal, picture.stem)) or -1)
 
         def camera(size: Size) -> tuple[Pose, Intrinsics]:
             if not 0 <= index < len(lines):

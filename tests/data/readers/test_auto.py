@@ -66,7 +66,7 @@ HINTS = {
     "recording of ARKit": {"ARWorldMap.dat": ""},
     "transforms.json under another name": {"a.json": '{"frames": [{"file_path": "a"}]}'},
     "project of Metashape": {"a.psx": ""},
-    "Kiri": {"a.zip": ""},
+    "A zip archive": {"a.zip": ""},
 }
 
 

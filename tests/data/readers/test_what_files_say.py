@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, TiffImagePlugin
 from support.malformed import edit_frame, edit_json
 from support.other_formats import write_ply
 from support.plain_capture import (
@@ -81,7 +81,15 @@ def test_fields_of_view_in_degrees_are_read_where_no_focal_length_is_given(root,
 
 
 @pytest.mark.parametrize(("frames", "remaining"), [(ALL, 0), ((4,), 8)])
-@pytest.mark.parametrize("keys", [{"k5": 0.1}, {"k6": -0.01}, {"camera_model": "FULL_OPENCV", "k4": 0.1}])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"camera_model": " full_opencv ", "k4": 0.1},
+        {"k5": 0.1},
+        {"k6": -0.01},
+        {"camera_model": "FULL_OPENCV", "k4": 0.1},
+    ],
+)
 def test_a_rational_lens_is_never_read_as_another_one(root, caplog, frames, remaining, keys):
     for view in frames:
         edit_frame(root, view, **keys)
@@ -101,6 +109,8 @@ DEPTHS = [
     ("depth_path", ".png", SIXTEEN, {"integer_depth_scale": 0.002}, {}, 8.0),
     ("depth_file_path", ".npy", np.full((3, 4), 4.0), {}, {}, 4.0),
     ("depth_file_path", ".npy", np.full((12, 16, 1), 4000.0, np.float32), {"depth_unit_scale_factor": 1e-3}, {}, 4.0),
+    ("depth_file_path", ".npy", SIXTEEN, {}, {}, 4.0),
+    ("depth_file_path", ".NPY", np.full((3, 4), 4.0), {}, {}, 4.0),
     ("depth_path", ".npy", np.where(np.eye(12, 16) > 0, np.nan, 4.0), {}, {}, 4.0),
 ]
 
@@ -110,13 +120,30 @@ def test_depth_maps_have_the_unit_that_the_file_or_the_user_says(root, key, endi
     for view in ALL:
         (root / "depths").mkdir(exist_ok=True)
         path = root / f"depths/{view}{ending}"
-        np.save(path, levels) if ending == ".npy" else save(path, levels)
+        if ending == ".png":
+            save(path, levels)
+        else:
+            with path.open("wb") as file:
+                np.save(file, levels)
     each_frame(root, **{key: f"depths/{{}}{ending}"})
     top(root, **keys)
     scene = read(root, "transforms", **typed.get("scene", {}))
     unit = float(np.linalg.det(scene.to_user[:3, :3].numpy()) ** (1 / 3))
     nearest = float(scene.depths.distance.min()) * unit  # in the middle of the picture
     assert nearest == pytest.approx(depth, rel=0.01)
+
+
+@pytest.mark.parametrize("unit", ["1", [1], 0, -1, True, {}, 1e308, 1e-300])
+def test_a_unit_of_depths_that_is_none_costs_the_depths_alone(root, caplog, unit):
+    top(root, depth_unit_scale_factor=unit)
+    read(root)
+    assert "Depth maps" not in caplog.text
+    save(root / "depths/0.png", SIXTEEN)
+    edit_frame(root, 0, depth_file_path="depths/0.png")
+    scene = read(root)
+    assert scene.depths is None
+    assert len(scene.view_names) == 9
+    said_once(caplog, "Depth maps are left out: .*depth_unit_scale_factor")
 
 
 def test_a_depth_map_that_is_no_picture_and_no_plane_is_named(root, caplog):
@@ -158,6 +185,7 @@ CUT_OUT = np.concatenate([photograph(1, 16, 12), HALF[..., None]], axis=-1)
 @pytest.mark.parametrize(
     "mask",
     [
+        *(HALF.astype(np.uint16), HALF.astype(np.uint16) // 255, HALF.astype(np.uint16) * 257),
         *(HALF, HALF // 255, np.minimum(HALF, 100), np.maximum(HALF, 200), CUT_OUT),
         *(HALF.repeat(4, 0).repeat(4, 1), HALF[::2, ::2]),
     ],
@@ -173,7 +201,17 @@ def test_ones_everywhere_are_white(tmp_path):
     assert read_mask(tmp_path / "m.png").all()
 
 
-@pytest.mark.parametrize("size", [(15, 12), (12, 16), (16, 11), (32, 30)])
+@pytest.mark.parametrize("radius", [1e308, 1e-9, -3, "wide", [4]])
+def test_an_odd_radius_keeps_all_or_leaves_the_views_out_in_words(root, radius):
+    top(root, fisheye_crop_radius=radius, camera_model="OPENCV_FISHEYE")
+    if radius == 1e308:
+        assert bool(read(root).pixels.kept(0).all())
+    else:
+        with pytest.raises(InputError, match=r"fisheye_crop_radius .*9 of the 9 views"):
+            read(root)
+
+
+@pytest.mark.parametrize("size", [(15, 12), (12, 16), (16, 11), (32, 30), (1, 1), (4, 2)])
 def test_masks_of_another_shape_are_refused(root, size):
     save(root / "masks/0.png", np.resize(HALF, size[::-1]))
     each_frame(root, mask_path="masks/0.png")
@@ -194,7 +232,7 @@ def test_names_of_masks_may_differ_in_zeros_case_and_ending(root, name):
     ("views", "masks", "used", "words"),
     [
         (ALL, None, True, r"has a mask for each photograph, which is used \(scene\.masks=none"),
-        (ALL[1:], None, False, r"has masks for 8 of 9 photographs and is not used; scene\.masks=masks uses it"),
+        (ALL[1:], None, False, r"not used, because it has masks for 8 of 9 photographs; scene\.masks=masks uses it"),
         (ALL, "none", False, None),
     ],
 )
@@ -208,6 +246,26 @@ def test_a_folder_of_masks_that_nothing_names(tmp_path, caplog, write, views, ma
         said_once(caplog, words)
     else:
         assert "scene.masks" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda folder, view: save(folder / f"p_{view}.png", HALF[:, :10]), "another shape than its photograph"),
+        (lambda folder, view: save(folder / f"p_{view}.png", 0 * HALF), "keeps nothing"),
+        (lambda folder, view: save(folder / f"p_{view}.png", photograph(view, 16, 12)), "has colors"),
+        (lambda folder, view: (folder / f"p_{view}.png").write_bytes(b"no picture"), "is not an image"),
+        (lambda folder, view: [save(folder / part / f"p_{view}.png", HALF) for part in "ab"], "equally well"),
+    ],
+)
+def test_a_folder_called_masks_that_holds_something_else_costs_nothing(root, caplog, write, words):
+    (root / "masks").mkdir()
+    for view in ALL:
+        write(root / "masks", view)
+    scene = read(root)
+    assert scene.pixels.mask is None
+    assert len(scene.view_names) == 9
+    said_once(caplog, rf"masks is not used, because .*{words}.*; scene\.masks=masks uses it")
 
 
 def test_instant_ngps_dynamic_masks_leave_out_what_is_white(root):
@@ -235,6 +293,15 @@ def test_colors_are_converted_from_their_profile(tmp_path, caplog):
     np.testing.assert_allclose(found[..., :3].astype(int), rgba[..., 2::-1], atol=2)
     np.testing.assert_array_equal(found[..., 3], rgba[..., 3])
     said_once(caplog, r"colors are converted from the profile .* to sRGB")
+
+
+@pytest.mark.parametrize(("kind", "value"), [(2, "text"), (3, 7), (4, 7), (12, 0.5), (7, bytes(5_000_000))])
+def test_a_profile_that_is_none_is_ignored(tmp_path, kind, value):
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags.tagtype[34675] = kind
+    tags[34675] = value
+    Image.fromarray(photograph(0, 16, 12)).save(tmp_path / "a.tif", tiffinfo=tags)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "a.tif")[..., :3], photograph(0, 16, 12))
 
 
 @pytest.mark.parametrize("color", [(255, 255, 255), (255, 0, 0), (0, 0, 0), (128, 128, 128)])
@@ -326,10 +393,10 @@ def test_an_archive_as_root_is_to_be_unpacked_and_one_of_numpy_is_none(tmp_path)
 @pytest.mark.parametrize(
     ("ending", "words"),
     [
-        (".gif", r"p_\d\.gif does\. Pictures of this format are not read"),
+        (".gif", r"p_\d\.gif does\. Files of this format are not read"),
         (".exr", r"p_\d\.exr does\. OpenEXR holds linear light"),
         (".nef", r"p_\d\.nef does\. RAW is not read"),
-        (".tga", r"p_\d\.tga does\. Pictures"),
+        (".tga", r"p_\d\.tga does\. Files"),
     ],
 )
 @pytest.mark.parametrize("write", [write_colmap, write_transforms])
@@ -339,6 +406,15 @@ def test_a_picture_of_a_format_that_is_not_read_is_found_and_named(tmp_path, wri
         (root / f"images/p_{view}.png").rename(root / f"images/p_{view}{ending}")
     with pytest.raises(InputError, match=words):
         read(root)
+
+
+def test_a_name_that_leads_out_tells_nothing_of_what_lies_there(tmp_path, root, caplog):
+    (tmp_path / "secret.gif").touch()
+    edit_frame(root, 0, file_path="../secret.jpg")
+    edit_frame(root, 1, file_path="a" * 249 + ".jpg", w=0)
+    edit_frame(root, 2, w=0)
+    assert len(read(root).view_names) == 6
+    assert "secret.gif" not in caplog.text
 
 
 @pytest.mark.parametrize("ending", [".jfif", ".jpe", ".JFIF"])
