@@ -58,7 +58,7 @@ $(VENV)/.usable: pyproject.toml constraints/torch.txt
 train: $(VENV)/.usable ## Train the built-in scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
-test: setup ## Run the tests, but for the exhaustive ones: 6 to 13 minutes on two cores
+test: setup ## Run the tests, but for the exhaustive ones: 6 to 16 minutes on two cores
 	@$(PYTEST)
 
 test-all: setup ## Run every test, the exhaustive ones included
