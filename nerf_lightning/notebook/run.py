@@ -13,7 +13,7 @@ from nerf_lightning.checkpoints.format import KEY, LIGHTNING
 from nerf_lightning.checkpoints.reading import checkpoint_of, content_to_resume, read_checkpoint
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.checkpoints.writing import write_checkpoint
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import key_of, quoted
@@ -194,11 +194,12 @@ def build_run(
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
+    chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
+    config = with_longest(config, overrides, settings.device_type == "cuda", chosen_before)
     scene = build(config.scene).read() if scene is None else scene
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     config.budget.seconds = None  # Lightning's Trainer, or `steps`, ends it
     config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type)
-    chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
     config, choices = resolve_correction(config, choices, overrides, former=chosen_before)
     guards = config.callbacks.collapse_guard, config.callbacks.nan_guard
     run = StepwiseRun(*vars(assemble(config, choices, settings, scene, model, loss)).values(), *map(build, guards))

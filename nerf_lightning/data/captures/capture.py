@@ -114,21 +114,6 @@ def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
     return "radial_tangential" if "radial_tangential" in kinds else "pinhole"
 
 
-def one_lens_model(kinds: set[LensModel], source: Path) -> LensModel:
-    """Return the model that holds all lenses of a capture; a pinhole where there are none.
-
-    Raises:
-        InputError: none does.
-    """
-    lens_model = common_lens_model(kinds)
-    if lens_model is None:
-        raise InputError(
-            f"{source} mixes lenses of several kinds ({listed(sorted(kinds))}), and a scene has one. Undistort the "
-            "photographs, or split the capture: one for each kind."
-        )
-    return lens_model
-
-
 def of_one_lens(capture: Capture, kinds: Sequence[LensModel]) -> Capture:
     """Return a capture with the lens model that holds those of all views (`kinds`), or of all but a few.
 
@@ -141,11 +126,14 @@ def of_one_lens(capture: Capture, kinds: Sequence[LensModel]) -> Capture:
     usual = max(groups, key=lambda group: sum(kind in group for kind in kinds))
     kept = [number for number, kind in enumerate(kinds) if kind in usual]
     if len(kinds) - len(kept) > MOST_ODD * len(kinds):
-        one_lens_model(set(kinds), capture.source)
+        raise InputError(
+            f"{capture.source} mixes lenses of several kinds ({listed(sorted(set(kinds)))}), and a scene has one. "
+            "Undistort the photographs, or split the capture: one for each kind."
+        )
     for view, kind in zip(capture.views, kinds, strict=True):
         if kind not in usual:
             capture.left_out.faults[view.name] = (
                 f"{capture.source}: {view.name} has another kind of lens ({kind}) than most views, and a scene has "
                 "one. Undistort the photographs."
             )
-    return replace(capture.some(kept), lens_model=one_lens_model(usual, capture.source))
+    return replace(capture.some(kept), lens_model=common_lens_model(usual) or "pinhole")

@@ -82,26 +82,30 @@ def usable(capture: Capture) -> Capture:
     return _with_known_depths(_with_sound_lenses(replace(capture, views=views, splits=splits).some(kept)))
 
 
+def cameras_as_given(capture: Capture) -> Cameras:
+    """Return the cameras of a capture as its format gives them (float64), at the sizes that they hold for."""
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
+
+    width, height = column("size").round().long().unbind(dim=-1)
+    return Cameras(
+        c2w=torch.stack([view.c2w for view in capture.views]),
+        focal=column("focal"),
+        center=column("center"),
+        lens=column("lens"),
+        lens_model=capture.lens_model,
+        width=width,
+        height=height,
+    )
+
+
 def _with_sound_lenses(capture: Capture) -> Capture:
     """Return the capture without the views whose lens cannot be inverted (`geometry.lens_checks`)."""
     views = capture.views
     if not views:
         return capture
-
-    def column(name: str) -> Tensor:
-        return torch.tensor([getattr(view, name) for view in views], dtype=torch.float64)
-
-    size = column("size").round().long()
-    cameras = Cameras(
-        c2w=torch.stack([view.c2w for view in views]),
-        focal=column("focal"),
-        center=column("center"),
-        lens=column("lens"),
-        lens_model=capture.lens_model,
-        width=size[:, 0],
-        height=size[:, 1],
-    )
-    faults = lens_faults(cameras, [view.name for view in views])
+    faults = lens_faults(cameras_as_given(capture), [view.name for view in views])
     capture.left_out.faults |= {views[number].name: fault for number, fault in faults.items()}
     kept = [number for number in range(len(views)) if number not in faults]
     capture.left_out.require_enough(len(kept))

@@ -22,14 +22,15 @@ NO_MASKS = "none"
 log = logging.getLogger(__name__)
 
 
-def with_masks(capture: Capture, masks: str | None, folders: Sequence[Path], keeps: str) -> Capture:
+def with_masks(capture: Capture, masks: str | None, named: Path | None, folders: Sequence[Path], keeps: str) -> Capture:
     """Return the views with their masks; photographs without one are kept whole.
 
     Args:
         capture: its views may have masks already, which its files name.
-        masks: a folder below one of `folders`, none, or None for what the files name, or else for a folder beside the
-            photographs that has one mask for each of them.
-        folders: those that masks may lie in, the first one first.
+        masks: the setting: a folder, none, or None for what the files name, or else for a folder in one of `folders`
+            that has one mask for each photograph.
+        named: the folder that the setting names, if it does.
+        folders: where a folder that nothing names may lie, the likeliest first.
         keeps: the color of what is kept, for messages.
 
     Raises:
@@ -38,17 +39,16 @@ def with_masks(capture: Capture, masks: str | None, folders: Sequence[Path], kee
     found = {view.name: view.photograph.mask for view in capture.views if view.photograph.mask is not None}
     if masks == NO_MASKS:
         found = {}
-    elif masks:
-        folder = next((path for each in folders if (path := each / masks).is_dir()), folders[-1] / masks)
-        named = _masks_in(folder, capture)
-        if not named:
+    elif named is not None:
+        of_setting = _masks_in(named, capture)
+        if not of_setting:
             first = capture.views[0].name
             raise InputError(
-                f"scene.masks={masks} holds no mask for any photograph of {capture.source}: {folder} holds "
-                f"{contents(folder)}. A mask is named after its photograph ({first}, with .png added, or with .png or "
+                f"scene.masks={masks} holds no mask for any photograph of {capture.source}: {named} holds "
+                f"{contents(named)}. A mask is named after its photograph ({first}, with .png added, or with .png or "
                 "_mask.png instead of its extension)."
             )
-        found |= named
+        found |= of_setting
     elif not found:
         found = _masks_beside(folders, capture)
     views = tuple(

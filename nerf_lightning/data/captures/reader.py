@@ -15,7 +15,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
+from nerf_lightning.data.captures.checks import (
+    FARTHEST,
+    LEAST_FOCAL,
+    cameras_as_given,
+    check_metres,
+    check_step,
+    usable,
+)
 from nerf_lightning.data.captures.masks import with_masks
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
@@ -126,7 +133,8 @@ class CaptureReader(Reader):
             train, held = every_kth(range(len(capture.views)), self.hold_every)
             capture = replace(capture, splits={"train": train, "val": held, "test": held})
         capture = as_calibrated(usable(capture))
-        capture = with_masks(capture, self.masks, (self.top(), self.folder()), self.masks_keep)
+        named = self.below(self.masks) if self.masks else None
+        capture = with_masks(capture, self.masks, named, (self.top(), self.folder()), self.masks_keep)
         downscale = self._factor(capture)
         capture, pixels = self._decoded(capture, downscale)
         capture.left_out.say(len(capture.views))
@@ -400,15 +408,12 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
             "read again."
         )
 
-    def column(name: str) -> Tensor:
-        return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
-
     scales = []
     for view, (width, height) in zip(capture.views, files, strict=True):
         require_fit(view, width, height)
         scales.append((width / view.size[0] / downscale, height / view.size[1] / downscale))
-    scale = torch.tensor(scales, dtype=torch.float64)
-    focal = column("focal") * scale
+    scale, given = torch.tensor(scales, dtype=torch.float64), cameras_as_given(capture)
+    focal = given.focal * scale
     possible = ((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all(dim=-1)
     if not bool(possible.all()):
         view = capture.views[possible.tolist().index(False)]
@@ -416,12 +421,11 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
             f"{capture.source}: the view {view.name} has a focal length of {view.focal[0]:g}, {view.focal[1]:g} pixels "
             f"of {view.size[0]:g} x {view.size[1]:g}, which no lens has on the picture that is there. Export it again."
         )
-    return Cameras(
-        c2w=torch.stack([view.c2w for view in capture.views]),
+    return replace(
+        given,
         focal=focal.float(),
-        center=(column("center") * scale).float(),
-        lens=column("lens").float(),
-        lens_model=capture.lens_model,
+        center=(given.center * scale).float(),
+        lens=given.lens.float(),
         width=pixels.width,
         height=pixels.height,
     )

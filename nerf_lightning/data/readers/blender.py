@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import check_step, usable
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -137,8 +137,7 @@ class BlenderReader(GivenFrameReader):
         read = {split: FrameFile.read(path, FORMAT) for split, path in files.items()}
         say_of_files(list(read.values()))
         left_out = LeftOut(str(files["train"]))
-        views: dict[str, list[View]] = {split: [] for split in SPLITS}
-        lenses = set[LensModel]()
+        views: dict[str, list[tuple[View, LensModel]]] = {split: [] for split in SPLITS}
         for split, file in read.items():
             skip = (self.skip or {}).get(split, 1)
             for found in views_of(file, root, self.allow_outside, left_out, skip):
@@ -146,20 +145,18 @@ class BlenderReader(GivenFrameReader):
                 name = (
                     Path(name).with_suffix("").as_posix() if name.lower().endswith(ENDINGS) else Path(name).as_posix()
                 )
-                views[split].append(replace(found.view, name=name))
-                lenses.add(found.lens_model)
+                views[split].append((replace(found.view, name=name), found.lens_model))
         left_out.require_enough(sum(map(len, views.values())))
-        lens_model = one_lens_model(lenses, root)
-        train, val, test = ([view.photograph.path for view in views[split]] for split in SPLITS)
+        train, val, test = ([view.photograph.path for view, _ in views[split]] for split in SPLITS)
         kept = set(apart(train, val, test, lambda image: image.name, self.root))
-        views["train"] = [view for view in views["train"] if view.photograph.path in kept]
-        names = _shortest([(split, view.name) for split in SPLITS for view in views[split]])
-        named = [replace(view, name=name) for view, name in zip(chain(*views.values()), names, strict=True)]
+        views["train"] = [each for each in views["train"] if each[0].photograph.path in kept]
+        names = _shortest([(split, view.name) for split in SPLITS for view, _ in views[split]])
+        every = list(chain(*views.values()))
+        named = [replace(view, name=name) for (view, _), name in zip(every, names, strict=True)]
         numbers = iter(range(len(named)))
         splits = {split: tuple(next(numbers) for _ in views[split]) for split in SPLITS}
-        return Capture(
-            views=tuple(named), source=files["train"], lens_model=lens_model, splits=splits, left_out=left_out
-        )
+        capture = Capture(tuple(named), files["train"], splits=splits, left_out=left_out)
+        return of_one_lens(capture, [kind for _, kind in every])
 
 
 def _file_of(root: Path, split: str) -> Path | None:

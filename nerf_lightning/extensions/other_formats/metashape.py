@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
@@ -98,7 +98,7 @@ class MetashapeReader(CaptureReader):
         component, aligned = _largest(list(_aligned(cameras)), chunk, path)
         labels = [label for label, _ in cameras]
         pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
-        views, lenses = [], set[LensModel]()
+        views, lenses = [], list[LensModel]()
         for label, camera, posed in aligned:
             with left_out.unless_usable(label):
                 if label not in pictures:
@@ -109,7 +109,7 @@ class MetashapeReader(CaptureReader):
                 if camera is not posed:
                     c2w = c2w @ _place_in_rig(sensors[number], f"{path}: the sensor {number} of {label}", path)
                 views.append(_view(c2w[:3], label, sensor, pictures[label]))
-                lenses.add(sensor.lens_model)
+                lenses.append(sensor.lens_model)
         left_out.require_enough(len(views))
         if terms := sorted(
             {each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and (each.text or "0").strip(" 0.")}
@@ -117,8 +117,8 @@ class MetashapeReader(CaptureReader):
             log.warning("%s: the lens has %s, which is not supported and is left out", path, " and ".join(terms))
         known = {view.name for view in views} | left_out.faults.keys()
         left_out.without_pose = tuple(label for label in labels if label not in known)
-        lens_model, undo = one_lens_model(lenses or {"pinhole"}, path), _to_world(component, path)
-        return Capture(tuple(views), path, lens_model, undo=undo, left_out=left_out)
+        undo = _to_world(component, path)
+        return of_one_lens(Capture(tuple(views), path, undo=undo, left_out=left_out), lenses)
 
     def _path(self, root: Path) -> Path:
         """Return the file that the user has named, or the only one."""

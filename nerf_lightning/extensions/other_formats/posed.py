@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View, one_lens_model
+from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, first_with_pictures
@@ -111,7 +111,7 @@ class PosedReader(CaptureReader):
                 require_printable(each.name, each.where)
                 named.append(each)
         files = find_pictures([each.name for each in named], folder, root, source, self.allow_outside)
-        views, kinds = [], set[LensModel]()
+        views, kinds = [], list[LensModel]()
         for each in named:
             with left_out.unless_usable(each.name):
                 if each.name not in files:
@@ -134,9 +134,9 @@ class PosedReader(CaptureReader):
                     )
                 )
                 is_plain = camera.lens_model == "radial_tangential" and not any(camera.lens)
-                kinds.add("pinhole" if is_plain else camera.lens_model)
+                kinds.append("pinhole" if is_plain else camera.lens_model)
         left_out.require_enough(len(views))
-        return Capture(tuple(views), source, one_lens_model(kinds or {"pinhole"}, source), left_out=left_out, **more)
+        return of_one_lens(Capture(tuple(views), source, left_out=left_out, **more), kinds)
 
     def given(self, program: str, size: Size = (1.0, 1.0)) -> Intrinsics:
         """Return the intrinsics that the user has given, for a picture of (width, height) pixels."""

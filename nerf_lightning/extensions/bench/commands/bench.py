@@ -22,7 +22,7 @@ from rich.table import Table
 from nerf_lightning.commands.train_job.build import typed_overrides
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
-from nerf_lightning.config.auto_settings import fit_model, takes_distances
+from nerf_lightning.config.auto_settings import fit_model, takes_distances, with_longest
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.extensions.bench.kernels import compared_kernels
@@ -45,8 +45,8 @@ Rows = dict[str, Float[np.ndarray, "rounds"]]
 
 def run(config: DictConfig) -> float:
     """Measure, print a table, write bench.json; return training rays per second."""
-    scene = build(config.scene).read()
-    bench = prepare(*_settled(config, scene))
+    config, scene = _settled(config)
+    bench = prepare(config, scene)
     for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
         bench.take_step()
     bench.train(config.steps)
@@ -73,11 +73,13 @@ def run(config: DictConfig) -> float:
     return float(result["training rays/s"]["median"])
 
 
-def _settled(config: DictConfig, scene: Scene) -> tuple[DictConfig, Scene]:
-    """Return config and scene with what model=auto chooses for it."""
+def _settled(config: DictConfig) -> tuple[DictConfig, Scene]:
+    """Return the config with what is chosen for its scene, and the scene."""
     choices, overrides = HydraConfig.get().runtime.choices, typed_overrides()
-    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     on_gpu = build(config.trainer).device_type == "cuda"
+    config = with_longest(config, overrides, on_gpu, former=None)
+    scene = build(config.scene).read()
+    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     return fit_model("bench", config, choices, overrides, scene, on_gpu)[0], scene
 
 
