@@ -101,7 +101,7 @@ def resolve_auto(
         InputError: a setting that is neither a value nor auto.
     """
     config = copy.deepcopy(config)
-    is_capture = "root" in config.scene and scene.capture_of is None
+    is_capture = config.scene.get("root", "") != "" and scene.capture_of is None  # of an archive it is empty
     seconds = config.budget.seconds
     if seconds == AUTO:
         has_steps = config.trainer.max_steps is not None or config.trainer.max_epochs is not None

@@ -70,7 +70,7 @@ def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
         ("callbacks.monitor=5", "callbacks.monitor=5 is not a callback. To remove one, add ~callbacks.monitor."),
         ("budget=null", "budget=None is not valid: it holds settings, such as budget.seconds=VALUE"),
         ("data.batch_rays=1000000000000", "data.batch_rays=1000000000000, which takes"),
-        ("scene.far=1e300", "scene.far is 1e+300, but rays need 0 <= near < far <= 1e+09"),
+        ("scene.far=1e300", "scene.near=2.0 and scene.far=1e+300: rays need 0 <= near < far <= 1e+09"),
         ("field=null", "A group was given something other than the name of one of its options"),
     ],
 )

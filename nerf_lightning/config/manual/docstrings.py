@@ -82,6 +82,7 @@ def _signature(lineage: list[tuple[str, Maker]]) -> dict[str, tuple[str, ast.exp
             return {each.arg: (module, each.annotation) for each in arguments if each.annotation} | found
         if "dataclass" in " ".join(map(ast.unparse, node.decorator_list)):
             fields = [each for each in node.body if isinstance(each, ast.AnnAssign)]
+            fields = [each for each in fields if not ast.unparse(each.annotation).startswith("ClassVar")]
             found = {ast.unparse(each.target): (module, each.annotation) for each in fields} | found
             found.pop("_", None)  # KW_ONLY
     return found

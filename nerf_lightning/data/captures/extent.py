@@ -79,6 +79,11 @@ def choose_space(
     if has_transparency:
         return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
     if ahead and cosine > FORWARD_FACING and (capture.bounds is not None or len(capture.points)):
+        if near is None and _nearest_depth(capture, cameras) is None:
+            return (
+                "contracted",
+                "since the cameras look the same way, but too few sparse points tell depths",
+            )
         try:
             _near_plane(capture, cameras, near)
         except InputError:
@@ -140,6 +145,24 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
             f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."
         )
     return Extent(to_user, nearest.float(), farthest.float(), aabb, None)
+
+
+def given_extent(capture: Capture, near: float | None, far: float | None, aabb_half: float | None) -> Extent:
+    """Return what files and settings give, in the capture's own frame.
+
+    Raises:
+        InputError: near, far or the box is given nowhere.
+    """
+    box = capture.box if aabb_half is None else _cube(aabb_half)
+    if near is None or far is None or box is None:
+        raise InputError(
+            f"scene.frame=given needs the distances between which content lies and its box, and {capture.source} does "
+            "not give them. Set scene.near, scene.far and scene.aabb_half, for example scene.near=2 scene.far=6 "
+            "scene.aabb_half=1.5, or use scene.frame=fitted."
+        )
+    views = len(capture.views)
+    eye = torch.eye(4, dtype=torch.float64)
+    return Extent(eye, torch.full((views,), float(near)), torch.full((views,), float(far)), box.float(), None)
 
 
 def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Capture) -> None:
@@ -264,7 +287,16 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far:
 def _near_plane(capture: Capture, cameras: Cameras, near: float | None) -> float:
     """Return how far before the cameras' middle the near plane of NDC lies; refuse one that a camera stands behind."""
     mean = average_pose(cameras.c2w)
-    plane = near if near is not None else NEAR_SHARE * _nearest_depth(capture, cameras)
+    plane = near
+    if plane is None:
+        nearest = _nearest_depth(capture, cameras)
+        if nearest is None:
+            raise InputError(
+                f"scene.space=ndc needs the depth at which content begins, and {capture.source} has neither "
+                "bounds nor enough sparse points in its pictures. Give scene.near in the capture's units, or use "
+                "scene.space=contracted."
+            )
+        plane = NEAR_SHARE * nearest
     ahead = -(cameras.c2w[:, :, 3] - mean[:, 3]) @ mean[:, 2]
     if float(ahead.max()) >= plane:
         view = capture.views[int(ahead.argmax())].name
@@ -276,18 +308,13 @@ def _near_plane(capture: Capture, cameras: Cameras, near: float | None) -> float
     return plane
 
 
-def _nearest_depth(capture: Capture, cameras: Cameras) -> float:
+def _nearest_depth(capture: Capture, cameras: Cameras) -> float | None:
+    """Return the depth at which content begins, as bounds or sparse points say; None where neither does."""
     if capture.bounds is not None:
         return float(capture.bounds.min())
     depths = [depths_of(capture, cameras, view) for view in range(len(capture.views))]
     found = [float(torch.quantile(each, QUANTILES[0])) for each in depths if len(each) >= FEWEST_POINTS]
-    if not found:
-        raise InputError(
-            f"scene.space=ndc needs the depth at which content begins, and {capture.source} has neither "
-            "bounds nor enough sparse points in its pictures. Give scene.near in the capture's units, or use "
-            "scene.space=contracted."
-        )
-    return min(found)
+    return min(found, default=None)
 
 
 def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor, ""]]:

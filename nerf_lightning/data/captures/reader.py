@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import ClassVar, Literal, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,7 @@ from nerf_lightning.data.captures.checks import (
 )
 from nerf_lightning.data.captures.masks import with_masks
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
-from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
+from nerf_lightning.data.captures.scene import Frame, Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
 from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
@@ -37,7 +37,7 @@ from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz
-from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
+from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene
 
 OF_PANORAMAS = 3.2
 """How many times as long as photographs panoramas may be, whose pixels cover all directions."""
@@ -75,20 +75,27 @@ class CaptureReader(Reader):
         axes: opengl, or opencv where the cameras in the files have axes right, down, forward although the format's are
             others; the doctor recognizes it.
         poses: c2w (camera to world), or w2c (world to camera) where the files have the inverse of the format's poses.
+        frame: fitted (upright, centered, of a handy size), or given: poses, near, far and the box are kept as files or
+            settings give them.
         near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
+        aabb_half: half the side of the box around the origin that holds the content, with frame=given; null: the box
+            that the capture has.
         metres_per_unit: length of the capture's unit in meters, if known: depths are then in meters, and GLB files have
             their true size. Capture formats do not store it. null: unknown.
         cut_out: if opaque photographs show an object on a plain background, make that transparent.
         background: the background of transparent pixels and of rays that leave the scene: white, black, random or none.
-            null: black; if a plain background was cut out, white_or_random, black_or_random or random, depending on its
-            color.
+            null: black (of the Blender format white); if a plain background was cut out, white_or_random,
+            black_or_random or random, depending on its color.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
         allow_outside: follow names that lead out of root; false refuses them, because the capture may be untrusted.
             Links are always followed.
         verify: compare the contents of all files with the cache, not only their times.
         name: the scene's name in reports.
     """
+
+    behind: ClassVar[Background] = "black"
+    """The background of a format where nobody says another."""
 
     root: str
     downscale: int | Literal["auto"] = 1
@@ -100,8 +107,10 @@ class CaptureReader(Reader):
     space: Spaces = "auto"
     axes: Axes = "opengl"
     poses: Poses = "c2w"
+    frame: Frame = "fitted"
     near: float | None = None
     far: float | None = None
+    aabb_half: float | None = None
     metres_per_unit: float | None = None
     cut_out: bool = True
     background: str | None = None
@@ -119,18 +128,18 @@ class CaptureReader(Reader):
         """
 
     def read(self) -> Scene:
-        """Return the capture as a scene in a working frame: upright, centered, of a handy size.
+        """Return the capture as a scene, in a working frame or its own.
 
         Raises:
             InputError: a setting that makes no sense, or anything wrong with the files.
         """
-        self._check_settings()
+        self.check_settings()
         with reading(self.root):
             capture = as_meant(self.capture(), self.axes, self.poses)
         capture = self._wanted(capture)
         if capture.splits is None and len(capture.views) > 1:
             # Before views are left out, so that the others keep their splits.
-            train, held = every_kth(range(len(capture.views)), self.hold_every)
+            train, held = self.hold_out(range(len(capture.views)))
             capture = replace(capture, splits={"train": train, "val": held, "test": held})
         capture = as_calibrated(usable(capture))
         named = self.below(self.masks) if self.masks else None
@@ -138,21 +147,17 @@ class CaptureReader(Reader):
         downscale = self._factor(capture)
         capture, pixels = self._decoded(capture, downscale)
         capture.left_out.say(len(capture.views))
-        splits = self._splits(capture)
+        splits, judged_by = self._splits(capture)
         files = [upright_size(view.photograph) for view in capture.views]
         # Panoramas have no background, and a fisheye's picture has a dark rim.
         has_edge = capture.lens_model in ("pinhole", "radial_tangential")
         pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and self.background != "none")
         cameras = cameras_of(capture, files, pixels, downscale)
-        protocol = {
-            "downscale": str(downscale),
-            "filter": "none" if downscale == 1 else "area, premultiplied",
-            "hold_every": str(self.hold_every),
-            "frames": self.frames or "all",
-        }
-        given = {"near": self.near, "far": self.far}
-        protocol |= {name: f"{value:g}" for name, value in given.items() if value is not None}
-        remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
+        protocol = {"downscale": str(downscale), "filter": "none" if downscale == 1 else "area, premultiplied"}
+        protocol |= self.protocol(judged_by) | protocol_of(color)
+        pictures = [(view.photograph.path, view.photograph.number) for view in capture.views]
+        learnt = {pictures[view] for view in splits["train"]}
+        remembered = MEMORISED if any(pictures[view] in learnt for view in splits["test"]) else {}
         return scene_of(
             capture,
             cameras,
@@ -162,10 +167,32 @@ class CaptureReader(Reader):
             space=self.space,
             near=self.near,
             far=self.far,
-            background=background_for(self.background, color, "black"),
-            protocol=protocol | protocol_of(color) | remembered,
+            background=background_for(self.background, color, self.behind),
+            protocol=protocol | remembered,
             metres_per_unit=self.metres_per_unit,
+            frame=self.frame,
+            aabb_half=self.aabb_half,
         )
+
+    def hold_out(self, views: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the views to learn from, and those to judge by, where the format names no splits.
+
+        Raises:
+            InputError: one of the two would be empty.
+        """
+        if self.hold_every < 2:
+            raise InputError(f"scene.hold_every={self.hold_every} would leave no training views: give 2 or more.")
+        return every_kth(views, self.hold_every)
+
+    def protocol(self, judged_by: str) -> dict[str, str]:
+        """Return what measured numbers depend on, besides how the pixels were made.
+
+        Args:
+            judged_by: the split whose views are the test views, or how they were held out.
+        """
+        given = {"near": self.near, "far": self.far}
+        said = {name: f"{value:g}" for name, value in given.items() if value is not None}
+        return {"hold_every": str(self.hold_every), "frames": self.frames or "all"} | said
 
     def folder(self) -> Path:
         """Return the capture's folder: `root`, the one folder just below it that is one, or the one above it.
@@ -173,15 +200,16 @@ class CaptureReader(Reader):
         Raises:
             InputError: there is no such folder, or several are such captures.
         """
-        return self._located_folder
+        return self.found_folder
 
     @cached_property
-    def _located_folder(self) -> Path:
+    def found_folder(self) -> Path:
+        """What `folder` returns, searched for once; who has searched already sets it."""
         folder = self.named_folder()
         found = located(folder, lambda path: path if self.found_in(path) else None)
         require_one(found, self.root)
         if found and found[0] != folder:
-            log.info("%s contains no capture for scene=%s; reading %s instead", self.root, self.name, found[0])
+            log.info("%s contains no capture for scene=%s; reading %s instead", self.root, type(self).name, found[0])
         return found[0] if found else folder
 
     def top(self) -> Path:
@@ -234,18 +262,17 @@ class CaptureReader(Reader):
             log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=1 keeps them)", factor, longest)
         return factor
 
-    def _check_settings(self) -> None:
+    def check_settings(self) -> None:
+        """Refuse settings that make no sense, before any file is read."""
         if self.downscale != "auto":
             check_step("downscale", self.downscale)
         check_step("longest", self.longest)
-        if self.hold_every < 2:
-            raise InputError(f"scene.hold_every={self.hold_every} would leave no training views: give 2 or more.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         require_one_of(get_args(Axes), **{"scene.axes": self.axes})
         require_one_of(get_args(Poses), **{"scene.poses": self.poses})
         check_metres(self.metres_per_unit)
-        background_for(self.background, None, "black")
-        check_extent(self.space, self.near, self.far)
+        background_for(self.background, None, self.behind)
+        check_extent(self.space, self.near, self.far, self.frame, self.aabb_half)
 
     def _wanted(self, capture: Capture) -> Capture:
         """Return the views whose names fit the pattern `frames`."""
@@ -261,24 +288,29 @@ class CaptureReader(Reader):
             )
         return capture.some(kept)
 
-    def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
+    def _splits(self, capture: Capture) -> tuple[dict[str, tuple[int, ...]], str]:
+        """Return the splits, and what the test views are; see `protocol`."""
         given = capture.splits or {"train": tuple(range(len(capture.views)))}
-        splits = {split: given.get(split, ()) for split in ("train", "val", "test")}
+        train, val, test = (given.get(split, ()) for split in ("train", "val", "test"))
         names = [view.name for view in capture.views]
-        splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
-        if splits["train"] and not (splits["val"] or splits["test"]):
-            log.warning(
-                "%s lists no held-out view that exists: every %dth view is held out", capture.source, self.hold_every
-            )
-            train, held = every_kth(splits["train"], self.hold_every)
-            return {"train": train, "val": held, "test": held}
-        if not splits["train"]:
+        train = apart(train, val, test, names.__getitem__, str(capture.source))
+        if not train:
             raise InputError(
                 f"{capture.source} lists no training view that exists. Fix its lists, or remove them so that "
                 f"every {self.hold_every}th view is held out."
             )
-        held = splits["val"] or splits["test"]
-        return {"train": splits["train"], "val": held, "test": splits["test"] or held}
+        if not (val or test):
+            log.warning(
+                "%s lists no held-out view that exists: every %dth view is held out", capture.source, self.hold_every
+            )
+            train, held = self.hold_out(train)
+            return {"train": train, "val": held, "test": held}, f"every {self.hold_every}th train view"
+        for missing, other, views in (("val", "test", test), ("test", "val", val)):
+            if not given.get(missing):
+                log.info(
+                    "%s has no %s split: the %d %s views serve as it", *(capture.source, missing, len(views), other)
+                )
+        return {"train": train, "val": val or test, "test": test or val}, "test" if test else "val"
 
 
 def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:

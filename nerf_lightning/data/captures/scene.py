@@ -1,28 +1,38 @@
 """From views with cameras and pixels, in the user's frame, to a scene in a working frame."""
 
 import logging
-import math
 from dataclasses import replace
 from typing import Literal, get_args
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
+from nerf_lightning.data.captures.checks import FARTHEST
+from nerf_lightning.data.captures.extent import choose_space, extent_of, given_extent, require_possible
 from nerf_lightning.data.captures.known_depths import known_depths
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene
+from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene, Space
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
+Frame = Literal["fitted", "given"]
 
 log = logging.getLogger(__name__)
 
 
-def check_extent(space: str, near: float | None, far: float | None) -> None:
-    """Refuse a space that there is none of, and distances between which nothing lies."""
+def check_extent(
+    space: str, near: float | None, far: float | None, frame: str = "fitted", aabb_half: float | None = None
+) -> None:
+    """Refuse a space or frame that there is none of, distances between which nothing lies, and a box of no size."""
+    require_one_of(get_args(Frame), **{"scene.frame": frame})
     if space not in get_args(Spaces):
         raise InputError(f"scene.space={space!r}: choose one of {', '.join(get_args(Spaces))}.")
-    if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
-        raise InputError(f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units.")
+    if frame == "given" and space == "ndc":
+        raise InputError("scene.space=ndc has a frame of its own. Use scene.frame=fitted, or another scene.space.")
+    if not 0.0 <= (near or 0.0) < (FARTHEST if far is None else far) <= FARTHEST:
+        raise InputError(
+            f"scene.near={near} and scene.far={far}: rays need 0 <= near < far <= {FARTHEST:g}, in the capture's units."
+        )
+    if aabb_half is not None and not 0 < aabb_half <= FARTHEST:
+        raise InputError(f"scene.aabb_half={aabb_half}: half the side of a box is above 0, and at most {FARTHEST:g}.")
 
 
 def scene_of(
@@ -38,8 +48,10 @@ def scene_of(
     background: Background,
     protocol: dict[str, str],
     metres_per_unit: float | None = None,
+    frame: Frame = "fitted",
+    aabb_half: float | None = None,
 ) -> Scene:
-    """Return a capture as a scene in a working frame: upright, centered, of a handy size.
+    """Return a capture as a scene, in its own frame or in a working frame: upright, centered, of a handy size.
 
     Args:
         capture: names, sparse points and bounds, in the user's frame.
@@ -53,14 +65,22 @@ def scene_of(
         background: what lies behind the scene.
         protocol: how the pixels were made.
         metres_per_unit: how many meters a unit of the user's frame is long; None: unknown.
+        frame: given: the capture's own frame is kept, with near, far and the box that are given.
+        aabb_half: half the side of the box around the origin, for a frame that is given; None: the capture's box.
 
     Raises:
         InputError: cameras and content that leave no room for a scene.
     """
     names = tuple(view.name for view in capture.views)
-    chosen, reason = choose_space(space, cameras, capture, pixels.has_transparency, near)
-    log.info("%s: space=%s, %s", name, chosen, reason)
-    extent = extent_of(capture, cameras, chosen, near, far)
+    chosen: Space
+    if frame == "given":
+        chosen = "contracted" if space == "contracted" else "bounded"
+        extent, c2w = given_extent(capture, near, far, aabb_half), cameras.c2w
+    else:
+        chosen, reason = choose_space(space, cameras, capture, pixels.has_transparency, near)
+        log.info("%s: space=%s, %s", name, chosen, reason)
+        extent = extent_of(capture, cameras, chosen, near, far)
+        c2w = poses_from_user(cameras.c2w, extent.to_user)
     to_user = capture.undo @ extent.to_user
     depths = known_depths(capture, cameras)
     if depths is not None:
@@ -68,7 +88,7 @@ def scene_of(
     require_possible(extent, to_user, capture)
     return Scene(
         name=name,
-        cameras=replace(cameras, c2w=poses_from_user(cameras.c2w, extent.to_user).float(), ndc=extent.ndc),
+        cameras=replace(cameras, c2w=c2w.float(), ndc=extent.ndc),
         pixels=pixels,
         near=extent.near,
         far=extent.far,

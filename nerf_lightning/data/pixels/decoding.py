@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.data.pixels.images import (
@@ -66,6 +66,12 @@ class Photograph:
     """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
     header: PictureHeader | None = None
     """Of the picture, where it was read already."""
+    number: int | None = None
+    """Of the picture, in a file of several."""
+
+    def rgba(self) -> UInt8[np.ndarray, "height width 4"]:
+        """Return the pixels, with straight alpha."""
+        return read_rgba(self.path, self.upright)
 
 
 def upright_size(photograph: Photograph) -> tuple[int, int]:
@@ -119,7 +125,7 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
     settings = {"format": FORMAT, "downscale": downscale, "files": files}
     if any(upright := [photograph.upright for photograph in photographs]):
         settings["upright"] = upright
-    for name in ("mask_keeps", "radius", "transparent"):
+    for name in ("mask_keeps", "radius", "transparent", "number"):
         if any(each := [getattr(photograph, name) for photograph in photographs]):
             settings[name] = each
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:24]
@@ -163,7 +169,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
 
     def decode(index: int) -> bool:
         photograph, size = photographs[index], sizes[index]
-        rgba = read_rgba(photograph.path, photograph.upright)
+        rgba = photograph.rgba()
         if photograph.transparent is not None:
             rgba[(rgba[..., :3] == photograph.transparent).all(axis=-1)] = 0
         rgba = area_downscale(crop_to_multiple(rgba, downscale), downscale)

@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -14,7 +12,6 @@ from torch import Tensor
 
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import free_memory
-from nerf_lightning.data.pixels.images import area_downscale, read_rgba
 from nerf_lightning.messages.console import progress_bar
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
@@ -79,16 +76,3 @@ def each_or_faults(work: Callable[[int], Result], count: int, label: str, shown:
     if faults:
         raise UndecodableError(dict(sorted(faults.items())))
     return [result for result in results if result is not None]
-
-
-def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:
-    """Return the pictures, in memory, each shrunk by `downscale`, which divides all `sizes` (width, height)."""
-    store = empty_store([(width // downscale, height // downscale) for width, height in sizes])
-
-    def decode(index: int) -> bool:
-        picture = area_downscale(read_rgba(paths[index]), downscale)
-        store.view(index).numpy()[...] = picture
-        return bool((picture[..., 3] < 255).any())
-
-    transparent = each_or_faults(decode, len(paths), label, shown=len(paths) > NOTICEABLE)
-    return replace(store, has_transparency=any(transparent))

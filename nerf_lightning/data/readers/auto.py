@@ -25,7 +25,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
-FIRST: tuple[type[Reader], ...] = (BlenderReader, TransformsReader, ColmapReader, LlffReader)
+FIRST: tuple[type[CaptureReader], ...] = (BlenderReader, TransformsReader, ColmapReader, LlffReader)
 """Where a folder has the files of several, the first says more: a COLMAP model has lenses and points, which
 poses_bounds.npy beside it lacks."""
 
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 @cache
-def readers() -> tuple[type[Reader], ...]:
+def readers() -> tuple[type[CaptureReader], ...]:
     """Return the readers whose formats are known by files: `FIRST`, then the others that yamls in `scene/` name."""
     texts = (conf_file(f"scene/{name}").read_text(encoding="utf-8") for name in option_names("scene"))
     targets = (str(yaml.safe_load(text)["_target_"]).rpartition(".") for text in texts)
@@ -53,7 +53,7 @@ class Known:
     folder: Path
     file: str
     """That tells the format."""
-    reader: type[Reader]
+    reader: type[CaptureReader]
 
     @property
     def scene(self) -> str:
@@ -88,13 +88,10 @@ class AutoReader(CaptureReader):
         return self.named_folder()
 
     def capture(self) -> Capture:
-        """Return what the format says, where it is one of photographs with their poses."""
-        reader = self.reader()
-        if not isinstance(reader, CaptureReader):
-            raise InputError(f"{self.root} is not a capture of photographs with poses. Name its format with scene=...")
-        return reader.capture()
+        """Return what the format says."""
+        return self.reader().capture()
 
-    def reader(self) -> Reader:
+    def reader(self) -> CaptureReader:
         """Return the reader of the format, and say which it is.
 
         Raises:
@@ -104,14 +101,17 @@ class AutoReader(CaptureReader):
         root = self.root if known.folder == self.folder() else str(known.folder)
         log.info("%s: read as scene=%s, because it has %s", root, known.scene, known.file)
         chosen = self._chosen() | {"root": self.root, "name": self.name, "downscale": self.downscale}
-        if not issubclass(known.reader, CaptureReader) and chosen["downscale"] == "auto":  # renderings, which are small
-            chosen = {name: value for name, value in chosen.items() if name not in ("downscale", "longest")}
+        if known.reader is BlenderReader and self.downscale == "auto":  # renderings, which are small
+            del chosen["downscale"]
         refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
         if refused:
             raise InputError(
                 f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it out."
             )
-        return known.reader(**chosen)
+        reader = known.reader(**chosen)
+        if not os.path.isfile(Path(self.root).expanduser()):  # a file may be a part of what its reader looks for
+            reader.found_folder = known.folder
+        return reader
 
     @staticmethod
     def known_format(folder: Path) -> Known | None:

@@ -12,12 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures, why_absent
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import read_header
+from nerf_lightning.data.pixels.images import read_header, read_rgba
+from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.readers.frame_keys import say_of_keys
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
@@ -49,6 +52,8 @@ ANGLES = {"camera_angle_": (math.pi, "pi radians"), "_fov": (180.0, "180 degrees
 """What a field of view is below, by its key."""
 TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
 """Keys of instant-ngp, by which pixels of that level have no content."""
+OF_PHOTOGRAPHS = ("fl_x", "fl_y", "k1", "k2", "p1", "p2", "camera_model", "aabb_scale")
+"""Keys that renderings of the Blender format do not have."""
 FORMAT = "A transforms.json of nerfstudio or instant-ngp"
 
 log = logging.getLogger(__name__)
@@ -76,6 +81,26 @@ class FrameFile:
                 "Negate the first and third columns of each transform_matrix, and remove it."
             )
         return cls(path, {key: value for key, value in content.items() if value is not None}, frames)
+
+    @property
+    def is_photographed(self) -> bool:
+        """Return whether these are photographs, as instant-ngp's are, and not renderings of the Blender format.
+
+        Photographs have a lens, or opaque pictures without one color at all four corners.
+        """
+        first = self.frames[0] if self.frames and isinstance(self.frames[0], dict) else {}
+        if any(key in {**self.content, **first} for key in OF_PHOTOGRAPHS):
+            return True
+        name, folder = first.get("file_path"), self.path.parent
+        pictures = find_pictures([name], folder, folder, self.path, beside=()) if isinstance(name, str) else {}
+        if not pictures:
+            return False
+        try:
+            picture = read_rgba(pictures[str(name)])
+        except InputError:
+            return False
+        corners = picture[:: picture.shape[0] - 1 or 1, :: picture.shape[1] - 1 or 1].reshape(-1, 4).astype(int)
+        return bool((picture[..., 3] == 255).all() and np.ptp(corners, axis=0).max() > 2 * TOLERANCE)
 
 
 def say_of_files(files: Sequence[FrameFile]) -> None:

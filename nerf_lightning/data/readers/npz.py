@@ -1,102 +1,117 @@
 """The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a numpy archive."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt8
 
 from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import pose_from_matrix, usable
+from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.splits import every_kth, in_order
+from nerf_lightning.data.captures.reader import CaptureReader
+from nerf_lightning.data.captures.scene import Frame
+from nerf_lightning.data.captures.splits import in_order
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import area_downscale
-from nerf_lightning.data.pixels.store import empty_store
-from nerf_lightning.data.readers.base import GivenFrameReader
+from nerf_lightning.data.pixels.images import PictureHeader
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
 from nerf_lightning.files.numpy_files import open_npz
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, resized
-from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
 LAYOUT = "It needs images (n, height, width, 3), poses (n, 4, 4) camera-to-world and one focal length in pixels."
 CURE = f"Remove it, and copy or download it again. {LAYOUT}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class StoredImage(Photograph):
+    """One of the images in an archive."""
+
+    image: Shaped[np.ndarray, "height width 3"] = field(compare=False, repr=False)
+
+    def rgba(self) -> UInt8[np.ndarray, "height width 4"]:
+        """Return the pixels as 8-bit colors, round(255 x), opaque; `InputError` refuses values outside of 0..1."""
+        image = self.image
+        if image.dtype != np.uint8:
+            # Written so that NaN fails too.
+            if not ((image >= 0) & (image <= 1)).all():
+                raise InputError(
+                    f"{self.path}: images[{self.number}] has values outside 0..1 or NaN. Divide 0..255 colors by 255, "
+                    "or store them as uint8."
+                )
+            image = np.rint(image.astype(np.float32) * 255).astype(np.uint8)
+        return np.concatenate([image, np.full((*image.shape[:2], 1), 255, np.uint8)], axis=2)
+
+
 @dataclass
-class NpzReader(GivenFrameReader):
+class NpzReader(CaptureReader):
     """Read `images` (n h w 3), `poses` (n 4 4, camera-to-world) and `focal` (pixels) from one file.
 
     Colors are floating point in 0..1 or uint8. The held-out views are both val and test.
 
     Args:
+        root: the .npz file, if `path` does not name it.
         path: the .npz file.
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
         train_fraction: with `hold_every` 0, the share of the views, from the first on, used for training.
         download: where to download a missing file: `url`, `bytes` and `sha256` (None: only its size is checked).
     """
 
-    path: str
+    root: str = ""
+    name: str = "npz"
+    frame: Frame = "given"
+    near: float | None = 2.0
+    far: float | None = 6.0
+    aabb_half: float | None = 1.5
     hold_every: int = 0
+    path: str | None = None
     train_fraction: float = 0.8
     download: Mapping[str, Any] | None = None
-    name: str = field(default="npz", kw_only=True)
 
-    def read(self) -> Scene:
-        """Return the capture, downloaded first if it is absent and an address is given.
+    def __post_init__(self) -> None:
+        self.root = self.path or self.root
 
-        Raises:
-            InputError: a setting that makes no sense, a failed download, or anything wrong with the file.
-        """
-        self.check_settings()
-        if self.hold_every < 0:
-            raise InputError(f"scene.hold_every is {self.hold_every}, but it must be 0 (in order) or more.")
-        path = Path(self.path)
+    def hold_out(self, views: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the views to learn from, and those to judge by."""
+        return super().hold_out(views) if self.hold_every else in_order(views, self.train_fraction)
+
+    def protocol(self, judged_by: str) -> dict[str, str]:
+        """Return what measured numbers depend on: which views are judged."""
+        rest = f"after the first {self.train_fraction:.0%}"
+        return {"test_views": f"every {self.hold_every}th" if self.hold_every else rest}
+
+    def folder(self) -> Path:
+        """Return the folder of the file."""
+        return self.named_folder()
+
+    def capture(self) -> Capture:
+        """Return the views, of a file that is downloaded first if it is absent and an address is given."""
+        path = Path(self.root)
         if self.download and not path.exists():
             fetch(self.download["url"], path, self.download["bytes"], self.download["sha256"])
         images, poses, focal = _load(path)
-        count, height, width, _ = images.shape
-        self.check_divisible(width, height)
+        _, height, width, _ = images.shape
         left_out, views = LeftOut(str(path)), []
-        for number, pose in enumerate(poses):
+        for number, (image, pose) in enumerate(zip(images, poses, strict=True)):
             with left_out.unless_usable(str(number)):
                 views.append(
                     View(
                         name=str(number),
-                        photograph=Photograph(path),
+                        photograph=StoredImage(
+                            path, number=number, header=PictureHeader((width, height), 1), image=image
+                        ),
                         c2w=pose_from_matrix(pose, f"{path}: poses[{number}]"),
                         focal=(focal, focal),
                         center=(width / 2, height / 2),
                         size=(float(width), float(height)),
                     )
                 )
-        views = list(usable(Capture(tuple(views), path, left_out=left_out)).views)
-        left_out.say(len(views))
-        images, count = images[[int(view.name) for view in views]], len(views)
-        cameras = pinhole_cameras(torch.stack([view.c2w for view in views]).float(), focal, width, height)
-        if self.hold_every:
-            train, held = every_kth(range(count), self.hold_every)
-        else:
-            train, held = in_order(range(count), self.train_fraction)
-        rest = f"after the first {self.train_fraction:.0%}"
-        return self.scene(
-            resized(cameras, cameras.width // self.downscale, cameras.height // self.downscale),
-            _pixels(images, self.downscale, path),
-            {"train": train, "val": held, "test": held},
-            [view.name for view in views],
-            {
-                "filter": "none" if self.downscale == 1 else "area",
-                "test_views": f"every {self.hold_every}th" if self.hold_every else rest,
-            },
-            otherwise="black",
-        )
+        left_out.require_enough(len(views))
+        return Capture(tuple(views), path, left_out=left_out)
 
 
 def _load(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
@@ -120,22 +135,3 @@ def _load(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     if focal.size != 1 or focal.dtype.kind not in "fiu":
         raise InputError(f"{path}: focal must be one number of pixels. {LAYOUT}")
     return images, poses, float(focal.reshape(-1)[0])
-
-
-def _pixels(images: Shaped[np.ndarray, "n h w 3"], downscale: int, path: Path) -> PixelStore:
-    """Return the pictures as 8-bit colors, round(255 x), opaque."""
-    count, height, width, _ = images.shape
-    store = empty_store([(width // downscale, height // downscale)] * count)
-    rgba = np.full((height, width, 4), 255, dtype=np.uint8)
-    for view, image in enumerate(images):
-        if image.dtype != np.uint8:
-            # Written so that NaN fails too.
-            if not ((image >= 0) & (image <= 1)).all():
-                raise InputError(
-                    f"{path}: images[{view}] has values outside 0..1 or NaN. Divide 0..255 colors by 255, "
-                    "or store them as uint8."
-                )
-            image = np.rint(image.astype(np.float32) * 255)
-        rgba[..., :3] = image
-        store.view(view).numpy()[...] = area_downscale(rgba, downscale)
-    return store

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from nerf_lightning.compute import ranks
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
-from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.sfm.find_poses import from_photographs, from_video
 from nerf_lightning.data.sfm.photograph_folder import files_in
@@ -39,7 +39,7 @@ class PhotosReader(AutoReader):
     video: str | None = None
     panoramas: Panoramas = "auto"
 
-    def reader(self) -> Reader:
+    def reader(self) -> CaptureReader:
         """Find the cameras, unless they are known, and return the reader of what was found.
 
         Raises:

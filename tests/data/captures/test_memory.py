@@ -45,5 +45,5 @@ def test_reading_takes_the_store_and_no_more(tmp_path):
     for num_bytes, pixels in growth:
         print(f"{num_bytes / pixels:.3f} bytes per pixel")
         assert num_bytes <= 4.2 * pixels + NOISE
-        # Much less than the store itself would mean that the peak had been reached before.
-        assert num_bytes >= 3.5 * pixels
+        # Much less would mean that the peak had been reached before; of a mapped store only what is looked at counts.
+        assert num_bytes >= 2.5 * pixels

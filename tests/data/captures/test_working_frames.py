@@ -101,6 +101,13 @@ def corridor(count=9):
     return look_at(eyes, eyes + ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).numpy()
 
 
+def test_auto_says_that_too_few_points_tell_depths(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    few = write_colmap(tmp_path / "c", Known(c2w=wall(), points=np.random.default_rng(1).uniform(4, 6, (9, 3))))
+    assert read("colmap", few).space == "contracted"
+    assert "but too few sparse points tell depths" in caplog.text
+
+
 def test_auto_takes_no_space_that_would_be_refused(tmp_path, caplog):
     points = np.random.default_rng(1).uniform([-1, 1, -1], [1, 12, 1], (300, 3))
     root = write_colmap(tmp_path / "c", Known(c2w=corridor(), points=points))

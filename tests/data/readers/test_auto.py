@@ -6,6 +6,7 @@ from support.captures import write_blender, write_npz
 from support.posed_captures import Known, read, write_colmap, write_llff, write_transforms
 
 from nerf_lightning.data.readers.auto import AutoReader
+from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.messages.errors import InputError
 
 WRITERS = {
@@ -27,6 +28,17 @@ def test_a_format_is_recognised_and_read_as_by_its_own_reader(tmp_path, caplog, 
     assert f"read as scene={kind}, because it has " in caplog.text
 
 
+def test_a_capture_below_the_folder_is_searched_for_and_said_once(tmp_path, caplog, monkeypatch):
+    caplog.set_level("INFO")
+    write_transforms(tmp_path / "capture", Known())
+    looked, found_in = [], TransformsReader.found_in
+    monkeypatch.setattr(TransformsReader, "found_in", lambda folder: looked.append(folder) or found_in(folder))
+    AutoReader(root=str(tmp_path)).read()
+    assert looked.count(tmp_path / "capture") == 1
+    assert f"{tmp_path / 'capture'}: read as scene=transforms" in caplog.text
+    assert "contains no capture" not in caplog.text
+
+
 def test_the_blender_format_keeps_its_own_defaults(tmp_path):
     write_blender(tmp_path, {"train": 10, "test": 2})
     scene = AutoReader(root=str(tmp_path)).read()
@@ -41,8 +53,8 @@ def test_settings_go_through_and_those_that_a_format_lacks_are_refused_by_name(t
         read("colmap", tmp_path / "colmap", hold_every=3).splits
     )
     write_blender(tmp_path / "blender", {"train": 10})
-    with pytest.raises(InputError, match=r"scene\.hold_every: scene=blender, which .* has no such setting"):
-        AutoReader(root=str(tmp_path / "blender"), hold_every=3).read()
+    with pytest.raises(InputError, match=r"scene\.images: scene=blender, which .* has no such setting"):
+        AutoReader(root=str(tmp_path / "blender"), images="train").read()
 
 
 def test_a_folder_of_no_known_format_is_told_what_is_looked_for(tmp_path):

@@ -10,6 +10,7 @@ from support.captures import FOV, picture, pose, real_capture, write_blender, wr
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, project
+from nerf_lightning.nerf.geometry.frames import points_to_user
 
 COUNTS = {"train": 9, "val": 2, "test": 3}
 
@@ -88,9 +89,15 @@ def test_names_are_the_shortest_that_differ(tmp_path, root):
 @pytest.mark.parametrize(
     ("absent", "val", "test", "judged", "said"),
     [
-        (("val",), (9, 10, 11), (9, 10, 11), "test", ["has no val split: the 3 test views serve as it."]),
-        (("test",), (9, 10), (9, 10), "val", ["has no test split: the 2 val views serve as it."]),
-        (("val", "test"), (0, 8), (0, 8), "every 8th train view", ["has no val or test split: every 8th train view"]),
+        (("val",), (9, 10, 11), (9, 10, 11), "test", "has no val split: the 3 test views serve as it"),
+        (("test",), (9, 10), (9, 10), "val", "has no test split: the 2 val views serve as it"),
+        (
+            ("val", "test"),
+            (0, 8),
+            (0, 8),
+            "every 8th train view",
+            "lists no held-out view that exists: every 8th view is held out",
+        ),
     ],
 )
 def test_a_missing_split_is_the_other_else_views_are_held_out(root, caplog, absent, val, test, judged, said):
@@ -100,8 +107,38 @@ def test_a_missing_split_is_the_other_else_views_are_held_out(root, caplog, abse
         scene = BlenderReader(str(root)).read()
     train = tuple(range(1, 8)) if len(absent) == 2 else tuple(range(9))
     assert scene.splits == {"train": train, "val": val, "test": test}
-    assert all(message.startswith(f"{root} {start}") for message, start in zip(caplog.messages, said, strict=True))
+    assert f"{root / 'transforms_train.json'} {said}" in caplog.messages
+    assert caplog.text.count(" split") == len(absent) % 2
     assert scene.protocol["test_views"] == judged
+
+
+def test_the_frame_may_be_fitted_to_the_cameras_instead(root):
+    given, fitted = (BlenderReader(str(root), frame=frame).read() for frame in ("given", "fitted"))
+    here, there = (scene.cameras.c2w[:, :, 3].double() for scene in (given, fitted))
+    assert float(there.norm(dim=-1).max()) < 2.0 < float(here.norm(dim=-1).max())
+    assert torch.allclose(points_to_user(there, fitted.to_user), here, atol=1e-5)
+
+
+def test_poses_of_other_conventions_are_read(root):
+    plain = BlenderReader(str(root)).read().cameras.c2w
+    for split, count in COUNTS.items():
+        others = [np.linalg.inv(pose(view) @ np.diag([1, -1, -1, 1])).tolist() for view in range(count)]
+        write_transforms(
+            root, split, [{"file_path": f"{split}/r_{n}", "transform_matrix": other} for n, other in enumerate(others)]
+        )
+    read = BlenderReader(str(root), axes="opencv", poses="w2c").read().cameras.c2w
+    assert torch.allclose(read, plain, atol=1e-5)
+
+
+def test_masks_count_and_a_size_that_is_no_multiple_is_cropped(root):
+    for path in root.rglob("r_*.png"):
+        mask = root / "masks" / path.relative_to(root)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.uint8([[0] * 8] * 3 + [[255] * 8] * 5)).save(mask)
+    pixels = BlenderReader(str(root), downscale=3).read().pixels
+    assert (pixels.width.tolist(), pixels.height.tolist()) == ([2] * 14, [2] * 14)
+    assert pixels.kept(0).tolist() == [[0, 0], [1, 1]]
+    assert BlenderReader(str(root), masks="none").read().pixels.mask is None
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".PNG", ""])

@@ -32,12 +32,13 @@ FRAME = {"file_path": "train/r_0", "transform_matrix": pose(0)}
         ({"downscale": 0}, r"scene.downscale is 0, but it must be 1"),
         ({"skip": {"test": 0}}, r"scene.skip.test is 0, but it must be 1"),
         ({"skip": {"tset": 2}}, r"scene.skip names the split 'tset'; the splits are train, val, test"),
-        ({"near": 6.0}, r"scene.near is 6.0 and scene.far is 6.0, but rays need 0 <= near < far"),
+        ({"near": 6.0}, r"scene.near=6.0 and scene.far=6.0: rays need 0 <= near < far"),
         ({"near": -1.0}, r"rays need 0 <= near < far"),
         ({"far": float("nan")}, r"rays need 0 <= near < far"),
         ({"background": "pink"}, r"background is 'pink'; choose one of white, black, random, white_or_random"),
-        ({"aabb_half": 0.0}, r"scene.aabb_half is 0.0"),
-        ({"downscale": 3}, r"downscale=3 does not divide .* 8 x 8 pixels. Choose one of 1, 2, 4, 8\."),
+        ({"aabb_half": 0.0}, r"scene.aabb_half=0.0"),
+        ({"space": "ndc"}, r"scene.space=ndc has a frame of its own. Use scene.frame=fitted"),
+        ({"aabb_half": None}, r"scene.frame=given needs .*train.json does not give them. Set scene.near, .*aabb_half"),
     ],
 )
 def test_refuses_settings(root, settings, message):
@@ -95,7 +96,7 @@ def test_leaves_out_a_view_that_cannot_be_used(root, caplog, content, message):
 def test_refuses_too_few_views(tmp_path, root):
     refused(write_blender(tmp_path / "one", {"train": 1}), "leaves 0 for training and 1 for evaluation")
     (root / "transforms_train.json").write_text('{"camera_angle_x": 1, "frames": []}')
-    refused(root, "scene has no views to learn from. Export transforms_train.json again")
+    refused(root, "transforms_train.json lists no training view that exists")
 
 
 def test_images_that_are_absent_are_left_out_and_named_once(tmp_path, caplog):
