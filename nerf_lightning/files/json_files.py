@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.regular import other_format, read_text
+from nerf_lightning.files.regular import read_text
+from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 

@@ -27,24 +27,6 @@ KINDS = {
 CURE = "It is damaged, or was made by somebody else: replace it with an intact copy, or remove it."
 MADE_AGAIN = "Remove it, and it will be made again."
 MOST_NAMES = 10  # Of a folder, in a message
-ARCHIVE, WEB_PAGE = (
-    "a {} archive: unpack it, and give what it holds",
-    "a web page (HTML): the download failed, repeat it",
-)
-ZIP, FILM = ARCHIVE.format("zip"), "a film: find its cameras with nerf poses video=FILE"
-SIGNATURES = (
-    (0, b"version https://git-lfs.", "a Git LFS pointer and not the file itself: fetch it with `git lfs pull`"),
-    (0, b"/annex/objects/", "a git-annex pointer and not the file itself: fetch it with `git annex get`"),
-    *((0, mark, WEB_PAGE) for mark in (b"<!doctype html", b"<html", b"<head")),
-    *((0, b"pk\x03\x04", ZIP), (0, b"\x1f\x8b", ARCHIVE.format("gzip")), (0, b"rar!", ARCHIVE.format("RAR"))),
-    *((0, b"7z\xbc\xaf\x27\x1c", ARCHIVE.format("7z")), (257, b"ustar", ARCHIVE.format("tar"))),
-    (0, b"%pdf", "a PDF document: use the pictures that it was made from"),
-    *((4, mark, FILM) for mark in (b"ftypqt", b"ftypmp4", b"ftypiso", b"ftypM4V", b"ftyp3gp", b"moov", b"wide")),
-    *((8, b"AVI ", FILM), (0, b"\x1aE\xdf\xa3", FILM)),
-)
-"""Where a file of another format has which bytes; at its beginning letters count as small ones."""
-ZIPS = (".npz", ".npy", ".ckpt", ".pt", ".pth")
-"""Files that are archives themselves, or may be."""
 
 
 class UnopenedError(InputError, OSError):
@@ -152,20 +134,6 @@ def what_is(path: Path) -> str:
     except (OSError, ValueError):  # NUL, too long, or a loop of links
         is_link = os.path.islink(path)
         return f"is a symbolic link to {os.readlink(path)}, which leads nowhere" if is_link else "does not exist"
-
-
-def other_format(path: Path) -> str | None:
-    """Return what a file is that is not what it is called, and the cure; None where its first bytes say nothing."""
-    try:
-        with open_regular(path, None) as file:
-            start = file.read(512)
-    except (InputError, OSError):
-        return None
-    text = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
-    for place, mark, words in SIGNATURES:
-        if (text if place == 0 and mark.isascii() else start[place:]).startswith(mark):
-            return None if words == ZIP and path.suffix.lower() in ZIPS else words
-    return None
 
 
 def contents(folder: Path) -> str:

@@ -1,5 +1,6 @@
-"""By what a file is known: its name, and words at its beginning."""
+"""By what a file is known: its name, and words or bytes at its beginning."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -12,6 +13,25 @@ HEAD = 1 << 16
 """Bytes of a file in which the words are looked for."""
 MOST_FILES = 20
 """Of a folder whose beginnings are read for one pattern."""
+
+ARCHIVE, WEB_PAGE = (
+    "a {} archive: unpack it, and give what it holds",
+    "a web page (HTML): the download failed, repeat it",
+)
+ZIP, FILM = ARCHIVE.format("zip"), "a film: find its cameras with nerf poses video=FILE"
+OTHERS = (
+    (0, b"version https://git-lfs.", "a Git LFS pointer and not the file itself: fetch it with `git lfs pull`"),
+    (0, b"/annex/objects/", "a git-annex pointer and not the file itself: fetch it with `git annex get`"),
+    *((0, mark, WEB_PAGE) for mark in (b"<!doctype html", b"<html", b"<head")),
+    *((0, b"pk\x03\x04", ZIP), (0, b"\x1f\x8b", ARCHIVE.format("gzip")), (0, b"rar!", ARCHIVE.format("RAR"))),
+    *((0, b"7z\xbc\xaf\x27\x1c", ARCHIVE.format("7z")), (257, b"ustar", ARCHIVE.format("tar"))),
+    (0, b"%pdf", "a PDF document: use the pictures that it was made from"),
+    *((4, mark, FILM) for mark in (b"ftypqt", b"ftypmp4", b"ftypiso", b"ftypM4V", b"ftyp3gp", b"moov", b"wide")),
+    *((8, b"AVI ", FILM), (0, b"\x1aE\xdf\xa3", FILM)),
+)
+"""Where a file of another format has which bytes; at its beginning letters count as small ones."""
+ZIPS = (".npz", ".npy", ".ckpt", ".pt", ".pth")
+"""Files that are archives themselves, or may be."""
 
 Signature = tuple[str, str]
 """A pattern of names below a folder, and a regular expression that the beginning of such a file contains; "" is any."""
@@ -40,11 +60,26 @@ def fits(path: Path, signature: Signature) -> bool:
     return fnmatch(path.name, pattern.rpartition("/")[2]) and (not words or bool(re.search(words, beginning(path))))
 
 
+def other_format(path: Path) -> str | None:
+    """Return what a file is that is not what it is called, and the cure; None where its first bytes say nothing."""
+    start = _start(path)
+    text = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    for place, mark, words in OTHERS:
+        if (text if place == 0 and mark.isascii() else start[place:]).startswith(mark):
+            return None if words == ZIP and path.suffix.lower() in ZIPS else words
+    return None
+
+
 def beginning(path: Path) -> str:
     """Return the beginning of a file as text, empty where it cannot be opened; what is no text becomes signs for it."""
+    text = _start(path).replace(b"\0", b"").decode("utf-8", "replace")
+    return text.removeprefix("\ufeff")  # UTF-16 is read, too
+
+
+def _start(path: Path) -> bytes:
+    """Return the first bytes of a file; none where it cannot be opened."""
     try:
         with open_regular(path, None) as file:
-            start = file.read(HEAD)
+            return file.read(HEAD)
     except (OSError, InputError):
-        return ""
-    return start.replace(b"\0", b"").decode("utf-8", "replace").removeprefix("\ufeff")  # UTF-16 is read, too
+        return b""

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import AbstractArray
 from torch import Tensor
 
-from nerf_lightning.files.regular import other_format
+from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError
 
 LARGEST_COUNT = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart

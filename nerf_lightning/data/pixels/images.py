@@ -24,7 +24,8 @@ from nerf_lightning.data.pixels.color_profiles import to_srgb
 from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, HEIC_KINDS, UNREAD, decoders
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.numpy_files import read_npy
-from nerf_lightning.files.regular import open_regular, other_format
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.row_chunks import row_chunks
 

@@ -19,8 +19,8 @@ from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.folders import conf_file, option_names
-from nerf_lightning.files.regular import contents, other_format
-from nerf_lightning.files.signatures import Signature, file_with
+from nerf_lightning.files.regular import contents
+from nerf_lightning.files.signatures import Signature, file_with, other_format
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene

@@ -48,6 +48,11 @@ class BlenderReader(CaptureReader):
         path = _file_of(folder, "train")
         return None if path is None or FrameFile.read(path, FORMAT).is_photographed else path.name
 
+    def folder(self) -> Path:
+        """Return the capture's folder; where `root` has the files, what their pictures look like does not matter."""
+        named = self.named_folder()
+        return named if _file_of(named, "train") else super().folder()
+
     def check_settings(self) -> None:
         """Refuse settings that make no sense, before any file is read."""
         super().check_settings()

@@ -119,6 +119,13 @@ def test_the_frame_may_be_fitted_to_the_cameras_instead(root):
     assert torch.allclose(points_to_user(there, fitted.to_user), here, atol=1e-5)
 
 
+def test_photographs_are_read_where_the_format_is_named(root):
+    for path in root.rglob("r_*.png"):
+        Image.open(path).convert("RGB").save(path)
+    write_blender(root / "below", {"train": 3, "test": 1})
+    assert len(BlenderReader(str(root)).read().view_names) == sum(COUNTS.values())
+
+
 def test_poses_of_other_conventions_are_read(root):
     plain = BlenderReader(str(root)).read().cameras.c2w
     for split, count in COUNTS.items():
