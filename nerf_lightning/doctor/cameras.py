@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerf_lightning.data.captures.left_out import ALL_CAMERAS
 from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, Given, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import image_plane
@@ -150,6 +151,9 @@ def number_of_views(evidence: Given) -> Check:
     message = f"{count} for training, {held} held out"
     if count >= FEW:
         return ok(message)
+    if (missing := len(evidence.scene.left_out)) > count + held:
+        message = f"{message}, and {missing} that are left out"
+        return (wrong if count < TOO_FEW else look)(message, ALL_CAMERAS)
     cure = "Take more photographs: 15 or more of a scene seen from the front, 50 to 100 all around."
     return (wrong if count < TOO_FEW else look)(message, cure)
 

@@ -38,7 +38,8 @@ class Scoring:
 
     Args:
         split: train, val or test.
-        max_views: maximum number of views, evenly spread over the split; None: all.
+        max_views: maximum number of views, evenly spread over the split; None: all. auto: `nerf train` chooses, for its
+            time budget; elsewhere all.
         quantize: round renders to 8 bits first, as in a saved image.
         num_pictures: number of views whose images are kept, evenly spread.
         num_worst: number of further views with the lowest PSNR.
@@ -51,7 +52,7 @@ class Scoring:
     """
 
     split: Literal["train", "val", "test"] = "test"
-    max_views: int | None = None
+    max_views: int | Literal["auto"] | None = None
     quantize: bool = False
     num_pictures: int = 5
     num_worst: int = 3
@@ -63,6 +64,8 @@ class Scoring:
     def __post_init__(self) -> None:
         if self.nearest_views is not None and self.nearest_views < 1:
             raise InputError(f"evaluation.nearest_views={self.nearest_views}: give at least one photograph, or null.")
+        if self.max_views == "auto":
+            self.max_views = None
         if self.max_views is not None and self.max_views < 1:
             raise InputError(f"evaluation.max_views={self.max_views}: give at least one view, or null for all.")
         for name, count in (("num_pictures", self.num_pictures), ("num_worst", self.num_worst)):
@@ -136,7 +139,7 @@ class Scoring:
             raise InputError(
                 f"The scene {scene.name} has no {self.split} views. Choose another split with evaluation.split=..."
             )
-        return evenly_spaced_subset(views, len(views) if self.max_views is None else self.max_views)
+        return evenly_spaced_subset(views, self.max_views if isinstance(self.max_views, int) else len(views))
 
     def _compare(
         self, picture: Picture, scene: Scene, view: int, background: Background

@@ -326,3 +326,31 @@ def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
         parts = assemble_job(*compose_config("train", overrides), overrides)
         assert bool(list(parts.system.step.correction.parameters())) == learnt
         assert parts.system.record["choices"]["correction"] == ("exposure" if learnt else "none")
+
+
+@pytest.mark.parametrize(
+    ("typed", "device", "evaluated"),
+    [
+        (("budget.seconds=120",), "cpu", 11),
+        (("budget.seconds=3",), "cpu", 3),
+        ((), "cpu", 29),
+        (("budget.seconds=120", "evaluation.max_views=null"), "cpu", None),
+        (("budget.seconds=120", "evaluation.max_views=50"), "cpu", 50),
+        (("trainer.max_steps=100",), "cpu", None),
+        (("budget.seconds=120",), "cuda", None),
+    ],
+)
+def test_no_more_views_are_evaluated_than_a_budget_has_time_for(typed, device, evaluated):
+    views = [0] * 40
+    size = {"width": torch.tensor([640]), "height": torch.tensor([480])}
+    scene = replace(PHOTOGRAPHS, splits=PHOTOGRAPHS.splits | {"test": tuple(views)})
+    scene = replace(
+        scene, cameras=replace(scene.cameras, **{k: v.expand(len(scene.view_names)) for k, v in size.items()})
+    )
+    config, choices = compose_config("train", typed)
+    config, choices = resolve_auto(config, choices, typed, scene, device)
+    assert config.evaluation.max_views == evaluated
+    former = OmegaConf.to_container(config, resolve=True)
+    typed = [each for each in typed if "max_views" in each]
+    again = resolve_auto(*compose_config("train", typed), typed, scene, "cpu", former)[0]
+    assert again.evaluation.max_views == evaluated

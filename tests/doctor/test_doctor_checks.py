@@ -151,6 +151,12 @@ def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
         ({"left_out": tuple("abcdefghijklmnop")}, "photographs without pose", "look", ("16 of 28",)),
         ({"splits": {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}}, "split", "wrong", ("view 2.png",)),
         ({"splits": {"train": (1, 2), "val": (0,), "test": (0,)}}, "number of views", "wrong", ("2 for training",)),
+        (
+            {"splits": {"train": (1, 2), "val": (0,), "test": (0,)}, "left_out": tuple("abcd")},
+            "number of views",
+            "wrong",
+            ("4 that are left out", "scene=photos scene.root=FOLDER"),
+        ),
     ],
 )
 def test_what_the_scene_says_of_itself(changes, name, verdict, fragments):

@@ -89,6 +89,8 @@ def assemble_job(
     scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type, former)
     settings.max_steps = config.trainer.max_steps
+    if post_training.scoring is not None:
+        post_training.scoring.max_views = config.evaluation.max_views
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
     run = assemble(config, picked, settings, scene)

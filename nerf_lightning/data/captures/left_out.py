@@ -11,6 +11,8 @@ from nerf_lightning.messages.escaping import listed
 FEWEST_VIEWS = 3
 """That must remain once a view is left out."""
 SHOWN = 3
+ALL_CAMERAS = "To use them, let their cameras be found: scene=photos scene.root=FOLDER, their folder."
+"""The advice where more photographs lack a pose than have one."""
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +64,8 @@ class LeftOut:
                 next(iter(self.faults.values())),
             )
         if self.without_pose:
+            cure = f" {ALL_CAMERAS}" if len(self.without_pose) > remaining else ""
             log.warning(
-                "%d photographs have no pose and are left out: %s", len(self.without_pose), listed(self.without_pose, 5)
+                "%d photographs have no pose and are left out: %s.%s",
+                *(len(self.without_pose), listed(self.without_pose, 5), cure),
             )

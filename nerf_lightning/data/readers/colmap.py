@@ -156,8 +156,9 @@ class ColmapReader(CaptureReader):
             )
         if len(found) > 1:
             log.info(
-                "%s is read, of %d models; scene.model=FOLDER reads another (%s)",
-                *(found[0], len(found), listed((path.relative_to(root) for path in found[1:]), 3)),
+                "%s is read, with %d photographs, of %d models; scene.model=FOLDER reads another (%s)",
+                *(found[0], _number_of_images(found[0]), len(found)),
+                listed((f"{path.relative_to(root)}: {_number_of_images(path)}" for path in found[1:]), 3),
             )
         return found[0]
 
@@ -218,15 +219,15 @@ def _require_known(camera: ColmapCamera, folder: Path) -> None:
 
 
 def models_in(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture: the likeliest place first, in it that with most images."""
+    """Return the folders of the models of a capture: most images first; of equal ones, the likeliest place."""
     models = list[Path]()
     for place in MODEL_FOLDERS:
         folder = root / place
         below = sorted(path for path in folder.iterdir() if path.is_dir()) if place and folder.is_dir() else []
         found = [path for path in (*below, folder) if any(os.path.lexists(path / f"cameras{e}") for e in KINDS)]
         found = [path for path in found if path not in models]
-        models += sorted(found, key=_number_of_images, reverse=True) if len(found) > 1 else found
-    return models
+        models += found
+    return sorted(models, key=_number_of_images, reverse=True) if len(models) > 1 else models
 
 
 def _number_of_images(folder: Path) -> int:

@@ -155,6 +155,11 @@ def many_features(root):
     edit_text(root, "images.txt", lambda text: text.replace("3.0 4.0 -1", "3.0 4.0 -1 " * 500))
 
 
+def few_cameras(root):
+    few = replace(KNOWN, c2w=KNOWN.c2w[:3], names=KNOWN.names[:3])
+    write_colmap(root, few, where="sparse/0", pictures=False)
+
+
 def split_json(first, second):
     def change(root):
         content = json.loads((root / "transforms.json").read_text())
@@ -174,7 +179,18 @@ def model(where, pictures, kind=".bin"):
 
 
 ROOTS = {
-    "sparse/1 has more": (model("sparse/1", "images"), many_features, "", r"sparse/1 is read, of 2 models"),
+    "sparse/1 has more": (
+        model("sparse/1", "images"),
+        many_features,
+        "",
+        r"sparse/1 is read, with 9 photo.*, of 2 models",
+    ),
+    "elsewhere are more": (
+        model("colmap/sparse/0", "images"),
+        few_cameras,
+        "",
+        r"colmap/sparse/0 is read, with 9 photographs, of 2 models; .* \(sparse/0: 3\)",
+    ),
     "flat": (model("", "", ".txt"), None, "", r"read as scene=colmap"),
     "undistorted": (model("distorted/sparse/0", "input"), None, "", r"read as scene=colmap"),
     "the model given": (write_colmap, None, "c/sparse/0", r"c: read as scene=colmap, because it has sparse/0"),

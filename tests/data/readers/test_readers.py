@@ -286,6 +286,11 @@ def test_photographs_without_pose_are_named(tmp_path, caplog):
     assert len(read("colmap", tmp_path / "c").view_names) == len(read("transforms", tmp_path / "d").view_names) == 9
     assert "2 photographs have no pose and are left out: lost.jpg, sub/lost.png" in caplog.text
     assert "1 photographs have no pose and are left out: images/zzz.png" in caplog.text
+    assert "scene=photos" not in caplog.text
+    many = tuple(f"lost_{number}.png" for number in range(10))
+    write_pictures(tmp_path / "d" / "images", many, (16, 12))
+    read("transforms", tmp_path / "d")
+    assert "let their cameras be found: scene=photos scene.root=FOLDER" in caplog.text
 
 
 @pytest.mark.parametrize("where", ["sparse/0", "sparse", "."])
