@@ -20,7 +20,7 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import child_of
-from nerf_lightning.messages.console import StdoutConsole, say, spoken
+from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
@@ -50,7 +50,7 @@ def run(config: DictConfig) -> int:
     print_checks(checks)
     seconds = time.monotonic() - started
     say(f"{summary(checks)}; {len(scene.view_names)} views examined in {spoken(seconds)}")
-    say(*(f"written to  {path}" for path in written))
+    say_written(*written)
     return sum(check.verdict == "wrong" for check in checks)
 
 

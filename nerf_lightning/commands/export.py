@@ -19,7 +19,7 @@ from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.export.base import Export, Neutral, PageExtras
 from nerf_lightning.files.json_files import read_json_object
-from nerf_lightning.messages.console import say
+from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.rays import PixelIndex
@@ -62,7 +62,7 @@ def export(config: DictConfig) -> list[Path]:
         written = write_files(what, opened, photographs, path, folder)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are the refined ones (refinement=...), not those that were read")
-    say(*map(str, written))
+    say_written(*written)
     return written
 
 

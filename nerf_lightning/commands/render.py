@@ -10,7 +10,7 @@ from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoints, scene_to_look_at
 from nerf_lightning.data.captures.checks import known_background
-from nerf_lightning.messages.console import say
+from nerf_lightning.messages.console import say_written
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
@@ -42,7 +42,7 @@ def render(config: DictConfig) -> None:
     default = beside_checkpoint(first.checkpoint.path, "render")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = film(subjects, path, first.tile_points, folder, shown)
-    say(*map(str, written))
+    say_written(*written)
 
 
 def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:

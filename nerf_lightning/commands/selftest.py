@@ -17,7 +17,7 @@ from nerf_lightning.compute.devices import has_tf32
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
-from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_console
+from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken, stderr_console
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.output_folder import output_folder
@@ -53,7 +53,7 @@ def run(config: DictConfig) -> None:
     say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in known.items()))
     result = {"right": all(row.outcome != "wrong" for row in rows), "device": settings.describe(), "machine": known}
     write_json(folder / "selftest.json", result | {"checks": [asdict(row) for row in rows]})
-    say(f"written to {folder / 'selftest.json'}")
+    say_written(folder / "selftest.json")
     if not result["right"]:
         raise SystemExit(1)
 

@@ -4,6 +4,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
@@ -128,6 +129,12 @@ def label_lines(label: str) -> None:
 def say(*lines: str) -> None:
     """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
     print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
+
+
+def say_written(*paths: Path) -> None:
+    """Print where files are, a line each, as all commands do."""
+    if paths:
+        say(*(f"{'written':<12} {path}" for path in paths))
 
 
 class StdoutConsole(Console):

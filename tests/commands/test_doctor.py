@@ -71,7 +71,7 @@ def test_opencv_axes_are_printed_with_their_cure_in_the_width_of_the_terminal(co
     assert "cure: Set scene.axes=opencv, or negate the second and third column of every rotation." in " ".join(
         result.out.split()
     )
-    assert [line for line in result.out.splitlines() if len(line) > 80 and not line.startswith("written to")] == []
+    assert [line for line in result.out.splitlines() if len(line) > 80 and not line.startswith("written")] == []
     assert "wrong; 10 views examined" in result.out
 
 

@@ -20,7 +20,7 @@ def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Pat
         f"reprojection error  {model.reprojection_error:.2f} px",
         f"points              {model.num_points}",
         f"time                {spoken(seconds)}",
-        f"written to          {folder}",
+        f"written             {folder}",
     ]
     if model.left_out:
         lines.append(f"left out            {listed(model.left_out)}")

@@ -36,7 +36,7 @@ from nerf_lightning.extensions.bench.stages import (
 )
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
+from nerf_lightning.messages.console import StdoutConsole, say_written, stderr_console
 from nerf_lightning.nerf.types.scene import Scene
 
 Work = Callable[[], Any]
@@ -69,7 +69,7 @@ def run(config: DictConfig) -> float:
     _print_table(result)
     folder = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
     write_json(folder / "bench.json", result)
-    say(f"written to {folder / 'bench.json'}")
+    say_written(folder / "bench.json")
     return float(result["training rays/s"]["median"])
 
 
