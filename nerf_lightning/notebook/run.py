@@ -74,7 +74,7 @@ class StepwiseRun(Run):
         step, batches, optimizer = self.system.step, self.data.batches, self.optimizer
         step.num_steps = until
         self.data.settle(step.device)
-        if self.settings.records(step) and not step.records:
+        if self.settings.records(step) and not step.recorded:
             step.record_gradients()
         rays = iter(batches)
         while self.num_steps < until:

@@ -14,6 +14,7 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
@@ -71,16 +72,14 @@ def build_step(
     correction.fit_to(scene)
     if start is not None:
         start.load_weights(model)
+    loss = build(config.loss) if loss is None else loss
+    rays = RayGenerator.of_views(scene, model, refinement)
     return TrainStep(
-        model=model,
-        rays=RayGenerator.of_views(scene, model, refinement),
-        loss=build(config.loss) if loss is None else loss,
-        correction=correction,
+        objective=Objective(model, rays, loss, scene.background, correction),
         optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,
         seed=config.seed,
-        background=scene.background,
         tile_points=settings.tile_points,
         clip_norm=settings.clip_norm,
         sample_budget=config.data.sample_budget,

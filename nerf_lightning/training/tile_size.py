@@ -79,6 +79,6 @@ def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> i
 
 
 def _seconds(settings: TrainerSettings, step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
-    step.tile_points = tile
+    step.tiles.points = tile
     some = batch[:num_rays]
     return seconds_of(lambda: step.gradients(some))

@@ -61,7 +61,7 @@ def built():
     progress = Progress()
     step = build_step(config, settings, scene, progress)
     settings.prepare(step.model)
-    step.tile_points, step.num_steps = TILE, 10
+    step.tiles.points, step.num_steps = TILE, 10
     return step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 

@@ -16,9 +16,9 @@ from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.training.gradients.recorded import cuda_graph
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.recorded_gradients import cuda_graph
-from nerf_lightning.training.step_output import StepOutput
 
 CPU = torch.device("cpu")
 KERNELS = CPU_BACKENDS
@@ -56,20 +56,20 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     sizes = [48] * 6
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert list(run.training._recorded.recordings) == [(48, (None,))]
+    assert list(run.training.recorded.recordings) == [(48, (None,))]
     assert run.training.model.statistics()["train/dropped_samples"] == 0
     assert run.all_losses().unique().numel() == 6
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert sorted(size for size, _ in run.training._recorded.recordings) == [32, 48]
+    assert sorted(size for size, _ in run.training.recorded.recordings) == [32, 48]
 
 
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():
     run, other = trained([48] * 3, record=True), trained([48] * 3, record=False)
     for each in (run, other):
         each.training.restart(each.optimizer)
-        assert each is other or not each.training._recorded.recordings
+        assert each is other or not each.training.recorded.recordings
         for _ in range(3):
             each.step()
     assert_same(run, other)
@@ -83,7 +83,7 @@ def test_what_asks_the_host_cannot_be_recorded(monkeypatch):
 
 def test_what_the_host_decides_is_refused_by_name():
     run = step_by_step("fast_small", CPU)
-    run.training.loss = RobustLoss(run.training.loss)
+    run.training.objective.loss = RobustLoss(run.training.objective.loss)
     encoder = next(each for each in run.training.model.modules() if isinstance(each, HashGridEncoder))
     encoder.blend_in = 0.5
     with pytest.raises(InputError, match=rf"{SETTING}.*another step: loss, encoder\.blend_in\. Leave it out"):
@@ -104,7 +104,7 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
 def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
     run = trained([48] * 6, True, model, *changes)
     assert_same(run, trained([48] * 6, False, model, *changes))
-    assert len(run.training._recorded.recordings) == variants
+    assert len(run.training.recorded.recordings) == variants
 
 
 def test_models_that_read_on_the_host_and_other_devices_are_refused(monkeypatch):
@@ -150,7 +150,7 @@ def test_what_cannot_be_recorded_is_computed_without(error, cause, caplog):
     for _ in range(3):
         run.step()
     assert [each.count(cause) for each in caplog.messages] == [1]
-    assert not run.training.records
+    assert not run.training.recorded
     assert_same(run, trained([48] * 3, record=False))
 
 
@@ -185,5 +185,5 @@ def test_steps_are_recorded_where_that_is_possible(setting, device, compile, mod
     settings = TrainerSettings(accelerator="cpu", cuda_graph=setting, compile=compile)
     settings.device_type = device
     assert settings.records(step) is recorded
-    step.loss = type("Own", (type(step.loss),), {"__module__": "my_parts"})()
+    step.objective.loss = type("Own", (type(step.objective.loss),), {"__module__": "my_parts"})()
     assert settings.records(step) is False

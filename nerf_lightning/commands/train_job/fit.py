@@ -93,7 +93,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         log.info("resuming from step %d of %s", former.step, folder.path)
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
-        step.tile_points = settings.tile_points
+        step.tiles.points = settings.tile_points
     settings.prepare(step.model)
     job.system.record["precision"] = settings.precision
     records = settings.records(step)
@@ -101,7 +101,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not records
     if former is None and measures_tile:
         tile, seconds = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
-        step.tile_points = settings.tile_points = tile
+        step.tiles.points = settings.tile_points = tile
         if seconds is not None:
             _announce_hours(job, seconds)
     if ranks.is_first():
@@ -133,7 +133,7 @@ def _announce_hours(job: TrainJob, seconds: float) -> None:
 
 def _announce(job: TrainJob, folder: HeldFolder) -> None:
     parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
-    step, tile = job.system.step, job.system.step.tile_points
+    step, tile = job.system.step, job.system.step.tiles.points
     seconds = job.config.budget.seconds
     log.info(
         "run folder %s: %s of %d rays, %s parameters, %s, %s",
@@ -144,7 +144,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         job.data.batches.batch_rays,
         f"{parameters:,}",
         job.settings.describe(),
-        "steps replayed" if step.records else "whole batches" if tile is None else f"tiles of {tile} points",
+        "steps replayed" if step.recorded else "whole batches" if tile is None else f"tiles of {tile} points",
     )
     if folder.former is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")

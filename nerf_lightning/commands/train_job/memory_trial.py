@@ -67,11 +67,11 @@ def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, til
 def _untouched(step: TrainStep) -> Iterator[None]:
     """Put everything back that trial steps change; no trial changes weights."""
     buffers, former = list(step.model.buffers()), [buffer.clone() for buffer in step.model.buffers()]
-    tile = step.tile_points
+    tile = step.tiles.points
     try:
         yield
     finally:
-        step.tile_points = tile
+        step.tiles.points = tile
         step.reset_statistics()
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
@@ -87,7 +87,7 @@ def _step(
 
     def held(tile_rays: int, parts: int) -> int:
         points = model.points_per_ray(training=True)
-        step.tile_points = int((tile_rays + 0.5) * points)
+        step.tiles.points = int((tile_rays + 0.5) * points)
         some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
 
         def work() -> None:
@@ -125,7 +125,7 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
     def rendered(count: int) -> int:
         some = pixels[torch.arange(count, device=device) % pixels.view.numel()]
         with torch.no_grad():
-            behind = background_colors(step.background, count, device, None)
+            behind = background_colors(step.objective.background, count, device, None)
             return peak_bytes(lambda: model(step.rays(some), behind, None), device)
 
     per_ray = (rendered(2 * few) - rendered(few)) / few

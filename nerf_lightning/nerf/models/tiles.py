@@ -42,6 +42,11 @@ def tile_rays_for(model: Model, tile_points: int, training: bool = False) -> int
     return max(1, int(tile_points / model.points_per_ray(training)))
 
 
+def pixels_in_tile(model: Model, tile_points: int, training: bool = False) -> int:
+    """Return how many pixels' rays make such a tile, at least one."""
+    return max(1, tile_rays_for(model, tile_points, training) // model.subpixels.per_pixel)
+
+
 def is_out_of_memory(error: RuntimeError) -> bool:
     """Tell whether there was no room for a tensor; smaller tiles may find it."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

@@ -9,8 +9,8 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.watcher import Watcher
-from nerf_lightning.training.step_output import StepOutput
 
 GIGABYTE = 1e9
 

@@ -21,6 +21,7 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
@@ -62,9 +63,8 @@ CASES = [
 
 def a_step(levels, scene, progress, loss):
     return TrainStep(
-        model=levels, rays=rays_of(scene), loss=loss, optimizer=lambda groups: TableAdam(groups, lr=0.02),
-        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=60, seed=0, background="random",
-        tile_points=4096,
+        Objective(levels, rays_of(scene), loss, "random"), optimizer=lambda groups: TableAdam(groups, lr=0.02),
+        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=60, seed=0, tile_points=4096,
     )  # fmt: skip
 
 
@@ -111,9 +111,8 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     model = RadianceModel({"fine": level})
     model.fit_to(scene)
     step = TrainStep(
-        model=model, rays=rays_of(scene), loss=MeanSquaredError(), optimizer=lambda groups: TableAdam(groups),
-        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, background="white",
-        sample_budget=1000,
+        Objective(model, rays_of(scene), MeanSquaredError(), "white"), optimizer=lambda groups: TableAdam(groups),
+        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, sample_budget=1000,
     )  # fmt: skip
     optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 512)

@@ -11,6 +11,7 @@ from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import show_photographs
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
@@ -38,8 +39,8 @@ def trained(name, scene):
     show_photographs(model, scene)
     progress, (steps, rays, _) = Progress(), LESS.get(name, (STEPS, RAYS, SIDE))
     step = TrainStep(
-        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, background_of(name),
-        TILE_POINTS, num_steps=steps,
+        Objective(model, rays_of(scene), loss, background_of(name)), build(config.optimizer), build(config.scheduler),
+        progress, 2, TILE_POINTS, num_steps=steps,
     )  # fmt: skip
     model.set_precision("bfloat16")
     batches, optimizer = RayBatches(scene, progress, 0, rays), step.new_optimizer()

@@ -39,7 +39,7 @@ def a_step(scene, refinement, model=None):
     step = make_step(None, model, background=scene.background)
     step.model.fit_to(scene)
     refinement.fit_to(scene)
-    step.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    step.objective.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
     return step
 
 

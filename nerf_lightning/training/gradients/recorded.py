@@ -16,9 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import parts_of
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.step_output import StepOutput
+from nerf_lightning.nerf.types.step_output import StepOutput
 
+KNOWN = (__name__.partition(".")[0], "torch")
+"""Packages of whose modules it is known whether a recorded step follows them."""
 # The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
 WARM_UPS = 3
 
@@ -124,3 +129,34 @@ def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
     for dtype in {each.dtype for each in targets}:
         ours, theirs = ([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources))
         torch._foreach_copy_(ours, theirs)
+
+
+def decided_on_host(objective: Objective) -> str | None:
+    """Return what decides on the host what a step computes, which a recording would not follow; None: nothing."""
+    model, correction = objective.model, objective.correction
+    decides = ["refinement"] if list(objective.rays.parameters()) else []
+    decides += [] if correction.replays else ["correction"]
+    penalized = [part for part in parts_of(objective) if part.penalty() is not None]
+    decides += ["a penalty"] if any(part is not correction for part in penalized) else []
+    decides += ["loss"] if objective.loss.buffers_to_average() else []
+    decides += ["model.subpixels"] if model.subpixels.side > 1 else []
+    decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in model.modules()) else []
+    return ", ".join(decides) or (None if model.replays else "model")
+
+
+def has_foreign_parts(objective: Objective) -> bool:
+    """Tell whether a class of somebody else's computes here, of which nobody knows what it decides on the host."""
+    return any(type(module).__module__.partition(".")[0] not in KNOWN for module in objective.modules())
+
+
+def require_replays(objective: Objective) -> None:
+    """Refuse what a recording would not follow.
+
+    Raises:
+        InputError: something decides on the host what a step computes.
+    """
+    if (decides := decided_on_host(objective)) is not None:
+        raise InputError(
+            "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
+            f"step: {decides}. Leave it out."
+        )
