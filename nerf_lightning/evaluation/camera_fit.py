@@ -17,6 +17,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import pixels_in_tile, tiles
 from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene
@@ -70,7 +71,7 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
 def _frozen(model: Model) -> Iterator[None]:
     """Let a model learn nothing and count nothing meanwhile."""
     learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    counts = [count.clone() for count in model.sample_counts()]
+    counts = [count.clone() for count in sample_counts(model)]
     try:
         for parameter in learning:
             parameter.requires_grad_(False)
@@ -78,5 +79,5 @@ def _frozen(model: Model) -> Iterator[None]:
     finally:
         for parameter in learning:
             parameter.requires_grad_(True)
-        for count, before in zip(model.sample_counts(), counts, strict=True):
+        for count, before in zip(sample_counts(model), counts, strict=True):
             count.copy_(before)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.nerf.corrections.base import Correction, NoCorrection
 from nerf_lightning.nerf.losses.base import Loss
@@ -13,7 +13,7 @@ from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
-from nerf_lightning.nerf.part import parts_of
+from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex, Target
@@ -22,7 +22,7 @@ from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.step_output import StepOutput
 
 
-class Objective(nn.Module):
+class Objective(Part):
     """The loss of pixels, with all that learns in it.
 
     Args:

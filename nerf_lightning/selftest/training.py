@@ -11,7 +11,7 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
-from nerf_lightning.nerf.matmul_precision import MatmulPrecision
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.check import Check, gradient_bound, norm_apart
 from nerf_lightning.selftest.scene import ball_scene
@@ -56,7 +56,7 @@ class Training:
         settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
         self.step = build_step(config, settings, scene, progress).to(device)
         self.step.num_steps = STEPS
-        self.step.model.set_precision(matmul_precision)
+        set_precision(self.step.model, matmul_precision)
         self.loader = RayBatches(on_device(scene, device), progress, SEED, BATCH_RAYS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
         self.optimizer = self.step.new_optimizer()

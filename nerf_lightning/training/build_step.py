@@ -15,6 +15,7 @@ from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
@@ -66,7 +67,7 @@ def build_step(
     if settings.device_type == "cpu":
         taken = model.kernels()
         compile_kernels([f"{KERNELS}.{name}" for name in CPU_BACKENDS if name in taken])
-    model.fit_to(scene)
+    fit_parts(model, scene)
     show_photographs(model, scene)
     correction: Correction = build(config.correction)
     correction.fit_to(scene)

@@ -1,6 +1,7 @@
 """One step of training, which needs torch and no trainer: gradients of the objective, clipped, become an update."""
 
 import logging
+from collections.abc import Hashable
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +12,13 @@ from torch.optim import Optimizer
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.groups import BuildOptimizer, optimizer_of
 from nerf_lightning.nerf.optimizers.schedule import Schedule
-from nerf_lightning.nerf.part import StepContext, parts_of
+from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, parts_of, sample_counts
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
@@ -78,8 +80,9 @@ class TrainStep:
         self.tiles, self.guard = TileGradients(objective, tile_points, jitter), StepGuard()
         self.recorded: RecordedGradients | None = None
         model, loss = objective.model, objective.loss
-        model.set_returns_weights(loss.needs_weights)
         for part in model.modules():
+            if isinstance(part, Level):
+                part.returns_weights = loss.needs_weights
             if isinstance(part, RaggedSampler) and sample_budget is not None:
                 part.sample_budget = -(-sample_budget // ranks.world_size())
         if model.subpixels.side > 1 and loss.needs_weights:
@@ -103,7 +106,7 @@ class TrainStep:
         """
         with self.tiles.on_threads(self.device):
             optimizer.zero_grad()
-            self._prepare_parts()
+            begin_step(self.objective, self._context())
             share = self._share(ranks.total(batch.weight.sum()))
             seen = self.gradients(batch, backward, share)
             ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
@@ -113,7 +116,7 @@ class TrainStep:
                     seen = replace(seen, gradient_norms=self.model.gradient_norms())
                 self._update(optimizer)
                 self.objective.loss.learn(seen.rgb, seen.target, seen.weight)
-                ranks.average(self.objective.loss.buffers_to_average())
+                ranks.average(buffers_to_average(self.objective.loss))
             self._advance(share.num_rays)
             return seen
 
@@ -141,19 +144,15 @@ class TrainStep:
             self.objective.zero_grad(set_to_none=False)
         return self.tiles(batch, self._key, share, backward)
 
-    def _prepare_parts(self) -> None:
-        progress = self.progress
-        if self.num_steps is not None:
-            context = StepContext(progress.step / self.num_steps, progress.step, self._key)
-            for part in parts_of(self.objective):
-                part.on_step(context)
-        self.model.update(progress.step, self._key)
+    def _context(self) -> StepContext:
+        if self.num_steps is None:
+            raise InputError("The length of the run is not known, which the learning rate follows: give num_steps=....")
+        return StepContext(self.progress.step / self.num_steps, self.progress.step, self._key)
 
     def _update(self, optimizer: Any) -> None:
         if self.clip_norm is not None:
             torch.nn.utils.clip_grad_norm_(self.objective.parameters(), self.clip_norm)
-        if self.num_steps is None:
-            raise InputError("The length of the run is not known, which the learning rate follows: give num_steps=....")
+        assert self.num_steps is not None
         factor = self.schedule(self.progress.step, self.num_steps)
         for group in optimizer.param_groups:
             group["lr"] = factor * group.setdefault("base_lr", group["lr"])
@@ -163,7 +162,7 @@ class TrainStep:
         progress = self.progress
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
-            ranks.average(self.model.buffers_to_average())
+            ranks.average(buffers_to_average(self.model))
             if self.sample_budget is not None:
                 wanted = self.sample_budget / self.model.points_per_ray(training=True)
                 progress.batch_rays = batch_size(progress.largest_batch, wanted, self.objective.together)
@@ -183,10 +182,14 @@ class TrainStep:
             return seen
 
         def counts() -> list[Tensor]:
-            return [*self.model.sample_counts(), *self.guard.tensors(self.device)]
+            return [*sample_counts(self.objective), *self.guard.tensors(self.device)]
 
-        parameters = list(self.objective.parameters())
-        self.recorded = RecordedGradients(compute, parameters, counts, lambda: self.model.step_variant, record)
+        parameters, parts = list(self.objective.parameters()), list(parts_of(self.objective))
+
+        def variant() -> tuple[Hashable, ...]:
+            return tuple(part.step_variant for part in parts)
+
+        self.recorded = RecordedGradients(compute, parameters, counts, variant, record)
 
     def forget_recordings(self) -> None:
         """Free the memory of all recordings; a further step makes new ones, of where everything lies then."""
@@ -225,11 +228,9 @@ class TrainStep:
         """Draw the weights of this attempt, or take those that it starts from."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(fold(self.seed, self.progress.attempt, "weights"))
-            for part in (self.objective.model, self.objective.rays, self.objective.correction):
-                part.reset_parameters()
+            self.objective.reset_parameters()
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
-        self.objective.loss.forget()
         self.forget_recordings()
 
     def restart(self, optimizer: Optimizer) -> None:
@@ -252,7 +253,8 @@ class TrainStep:
     def reset_statistics(self) -> None:
         """Undo what trial steps have left behind: gradients and counts, no weights."""
         self.objective.zero_grad(set_to_none=True)
-        self.model.reset_statistics()
+        for part in parts_of(self.objective):
+            part.reset_statistics()
 
     def all_finite(self) -> bool:
         """Tell whether the run is one to come back to: the last step was taken, and the weights are finite."""

@@ -73,7 +73,7 @@ def warm(step, batches):
         step.model(step.rays(few.pixels), None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
     step.reset_statistics()
-    step.model.update(0, 0)
+    average_counts(step.model)
 
 
 def train():

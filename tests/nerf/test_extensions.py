@@ -24,6 +24,7 @@ from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.part import fit_parts, statistics
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.video.film import film
@@ -46,7 +47,7 @@ ADDED = {
 def a_step(overrides) -> TrainStep:
     config, scene = composed("train", SEARCHED, *overrides), ball_scene(num_views=8, size=16, background="random")
     model = build(config.model)
-    model.fit_to(scene)
+    fit_parts(model, scene)
     return TrainStep(
         Objective(model, rays_of(scene), build(config.loss), "random"),
         lambda groups: torch.optim.Adam(groups, lr=2e-2), ExponentialDecay(decay_rate=1.0), Progress(), 0, 4096,
@@ -127,7 +128,7 @@ def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
     with torch.no_grad():
         walked = step.model(rays, torch.ones(64, 3), None)[0]
     torch.testing.assert_close(walked.rgb, whole.rgb.detach(), atol=2e-3, rtol=0)
-    assert "train/occupied" not in step.model.statistics()
+    assert "train/occupied" not in statistics(step.model)
 
 
 def test_a_table_of_cameras_is_a_capture(tmp_path):

@@ -14,6 +14,7 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.training.step import TrainStep
@@ -47,7 +48,7 @@ OPTIMIZERS = {
 def static_system(name: str, scene, progress, num_steps: int, model=None, loss=None) -> RadianceFieldSystem:
     """The system that trains one of the two models on whole batches."""
     model = model or MODELS[name]()
-    model.fit_to(scene)
+    fit_parts(model, scene)
     step = TrainStep(
         objective=Objective(model, rays_of(scene), loss or MeanSquaredError(), scene.background),
         optimizer=OPTIMIZERS[name],

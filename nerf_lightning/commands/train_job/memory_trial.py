@@ -22,6 +22,7 @@ from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.render_image import Picture
+from nerf_lightning.nerf.models.sample_counter import average_counts
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
@@ -98,7 +99,7 @@ def _step(
         return peak_bytes(work, settings.device)
 
     held(_few_rays(model, training=True), 1)  # compiles kernels
-    model.update(0, 0)  # how many samples rays have is known from here on
+    average_counts(model)  # how many samples rays have is known from here on
     few = _few_rays(model, training=True)
     two, four, larger = held(few, 2), held(few, 4), held(2 * few, 2)
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few

@@ -16,6 +16,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.rendering.blending import background_colors
@@ -105,7 +106,7 @@ class Bench:
         samplers = [level.sampler for level in model.modules() if isinstance(level, RaggedLevel)]
         former = [sampler.opaque_below for sampler in samplers]
         self.step.tiles.points = None
-        model.set_precision("float32")
+        set_precision(model, "float32")
         for sampler in samplers:
             sampler.opaque_below = 0.0
         self._release_gradients()

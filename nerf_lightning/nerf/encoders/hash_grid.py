@@ -97,6 +97,11 @@ class HashGridEncoder(Encoder):
         # While levels are blended in they are computed again: what is known has been weighted.
         return self._interpolate(points, None if self._blends else features.reshape(-1, self.out_dim))
 
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
+        """Whether no levels are blended in."""
+        return not self.blend_in
+
     def on_step(self, context: StepContext) -> None:
         """Blend the levels in that are due: level l (from 0) rises over the l-th part of `blend_in`."""
         if self.blend_in:

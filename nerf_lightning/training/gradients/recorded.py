@@ -5,7 +5,7 @@ than the GPU to compute. A replayed graph asks once (https://pytorch.org/blog/ac
 
 What is recorded is what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
 of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and what
-a model decides on the host between two steps has recordings of its own (`Model.step_variant`).
+a model decides on the host between two steps has recordings of its own (`Part.step_variant`).
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -18,7 +18,6 @@ from torch.nn import Parameter
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.objective import Objective
-from nerf_lightning.nerf.part import parts_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.step_output import StepOutput
 
@@ -131,22 +130,20 @@ def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
         torch._foreach_copy_(ours, theirs)
 
 
-def decided_on_host(objective: Objective) -> str | None:
-    """Return what decides on the host what a step computes, which a recording would not follow; None: nothing."""
-    model, correction = objective.model, objective.correction
-    decides = ["refinement"] if list(objective.rays.parameters()) else []
-    decides += [] if correction.replays else ["correction"]
-    penalized = [part for part in parts_of(objective) if part.penalty() is not None]
-    decides += ["a penalty"] if any(part is not correction for part in penalized) else []
-    decides += ["loss"] if objective.loss.buffers_to_average() else []
-    decides += ["model.subpixels"] if model.subpixels.side > 1 else []
-    decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in model.modules()) else []
-    return ", ".join(decides) or (None if model.replays else "model")
+def not_replayed(objective: Objective, only_known: bool = False) -> list[str]:
+    """Return the classes of those parts whose steps a recording would not follow, each once.
 
-
-def has_foreign_parts(objective: Objective) -> bool:
-    """Tell whether a class of somebody else's computes here, of which nobody knows what it decides on the host."""
-    return any(type(module).__module__.partition(".")[0] not in KNOWN for module in objective.modules())
+    Args:
+        objective: what would be recorded.
+        only_known: those of somebody else's classes, too, that do not say themselves whether it would (`Part.replays`).
+    """
+    found = {}
+    for module in objective.modules():
+        kind = type(module)
+        unknown = kind.__module__.partition(".")[0] not in KNOWN and "replays" not in vars(kind)
+        if not getattr(module, "replays", True) or (only_known and unknown):
+            found[kind.__name__] = True
+    return list(found)
 
 
 def require_replays(objective: Objective) -> None:
@@ -155,8 +152,8 @@ def require_replays(objective: Objective) -> None:
     Raises:
         InputError: something decides on the host what a step computes.
     """
-    if (decides := decided_on_host(objective)) is not None:
+    if kinds := not_replayed(objective):
         raise InputError(
             "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
-            f"step: {decides}. Leave it out."
+            f"step: {', '.join(kinds)}. Leave it out."
         )

@@ -15,6 +15,7 @@ from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, pixels_in_tile, tiles
 from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.step_output import StepOutput
@@ -72,7 +73,7 @@ class TileGradients:
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
         with self.on_threads(batch.weight.device):
             while True:
-                counts = [count.clone() for count in self.objective.model.sample_counts()]
+                counts = [count.clone() for count in sample_counts(self.objective)]
                 try:
                     return self.in_tiles_of(self._pixels_in_tile(batch), batch, share, key, backward)
                 except RuntimeError as error:
@@ -81,7 +82,7 @@ class TileGradients:
                     forget_workspaces()
                     self._take_smaller_tiles(batch, error)
                 self.objective.zero_grad(set_to_none=False)
-                for count, before in zip(self.objective.model.sample_counts(), counts, strict=True):
+                for count, before in zip(sample_counts(self.objective), counts, strict=True):
                     count.copy_(before)
 
     def in_tiles_of(

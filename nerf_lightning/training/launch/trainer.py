@@ -14,7 +14,7 @@ from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precisi
 from nerf_lightning.compute.ranks import processes_here, world_size
 from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.training.gradients.recorded import decided_on_host, has_foreign_parts
+from nerf_lightning.training.gradients.recorded import not_replayed
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
@@ -107,13 +107,8 @@ class TrainerSettings(ComputeSettings):
         """
         if self.cuda_graph != "auto":
             return self.cuda_graph
-        tried = (
-            self.device_type == "cuda"
-            and world_size() == 1
-            and not self.compile
-            and not has_foreign_parts(step.objective)
-        )
-        return tried and decided_on_host(step.objective) is None
+        tried = self.device_type == "cuda" and world_size() == 1 and not self.compile
+        return tried and not not_replayed(step.objective, only_known=True)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""

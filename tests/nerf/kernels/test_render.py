@@ -137,7 +137,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     weight, background = torch.randn(700, 8), torch.rand(700, 3)
     seen, gradients = learnt(level, rays, random, weight, background)
     asked = int(level.counter.counts[0])
-    level.reset_statistics()
+    level.counter.reset_statistics()
     with without("render.gradients"):
         expected, of_single = learnt(level, rays, random, weight, background)
     assert 0.1 < float(expected[:, 6].mean()) < 0.9

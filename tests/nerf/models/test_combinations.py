@@ -24,6 +24,7 @@ from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
@@ -73,7 +74,7 @@ def test_it_learns(model, field, position, direction):
     torch.manual_seed(4)
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     levels = RadianceModel(MODELS[model](lambda: FIELDS[field](POSITIONS[position](), DIRECTIONS[direction]())))
-    levels.fit_to(scene)
+    fit_parts(levels, scene)
     step = a_step(levels, scene, progress, ProposalLoss() if model == "proposal" else MeanSquaredError())
     optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 64)
@@ -93,7 +94,7 @@ def test_every_kind_of_level_learns_known_depths(model):
     distance = scene.cameras.c2w[:, :, 3].norm(dim=-1) - BALL_RADIUS
     scene = replace(scene, depths=KnownDepths(PixelIndex(view, middle, middle), distance, torch.ones(8)))
     levels = RadianceModel(MODELS[model](lambda: FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]())))
-    levels.fit_to(scene)
+    fit_parts(levels, scene)
     plain = ProposalLoss() if model == "proposal" else MeanSquaredError()
     step = a_step(levels, scene, progress, WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}))
     loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), step.new_optimizer(), []
@@ -109,7 +110,7 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
         FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
     )
     model = RadianceModel({"fine": level})
-    model.fit_to(scene)
+    fit_parts(model, scene)
     step = TrainStep(
         Objective(model, rays_of(scene), MeanSquaredError(), "white"), optimizer=lambda groups: TableAdam(groups),
         schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, sample_budget=1000,

@@ -20,7 +20,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.objective import Objective
-from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.part import StepContext, fit_parts
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import blend
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -159,7 +159,7 @@ def model_with(side, start=0.0, density_bias=0.5):
     torch.manual_seed(3)
     plain = tiny_model(density_bias=density_bias)
     model = RadianceModel(dict(plain.levels.items()), subpixels=side, subpixels_from=start)
-    model.fit_to(ball_scene())
+    fit_parts(model, ball_scene())
     return model
 
 

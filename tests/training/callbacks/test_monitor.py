@@ -17,6 +17,7 @@ from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.monitor import level_scalars
@@ -47,7 +48,7 @@ def test_the_psnr_is_that_of_the_colours_whatever_the_loss_is(model, loss):
     config = composed("train", f"model={model}", *small, *([] if loss == "L1" else [f"loss={loss}"]))
     scene, progress = ball_scene(num_views=8, size=16), Progress()
     built = build(config.model)
-    built.fit_to(scene)
+    fit_parts(built, scene)
     step = TrainStep(
         Objective(built, rays_of(scene), L1() if loss == "L1" else build(config.loss), "white"),
         lambda groups: torch.optim.Adam(groups), ExponentialDecay(), progress, 0, 4096, num_steps=100,
