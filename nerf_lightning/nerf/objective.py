@@ -86,6 +86,10 @@ class Objective(Part):
         background = self._background(batch, None)
         return self._render(batch.pixels, background, None), self._target(batch, background)
 
+    def named_weights(self) -> Iterator[tuple[str, Tensor]]:
+        """Return all parameters by name, those of the model by the names that they have there."""
+        return ((name.removeprefix("model."), weight) for name, weight in self.named_parameters())
+
     def penalties(self) -> Iterator[Float[Tensor, ""]]:
         """Return what parts add to the loss of a whole step, whatever its pixels are."""
         return (penalty for part in parts_of(self) if (penalty := part.penalty()) is not None)

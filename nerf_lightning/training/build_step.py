@@ -86,4 +86,5 @@ def build_step(
         sample_budget=config.data.sample_budget,
         start_weights=None if start is None else start.weights,
         jitter=config.data.overfit_views is None,
+        records=settings.records_there,
     )

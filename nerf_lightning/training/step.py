@@ -1,7 +1,7 @@
 """One step of training, which needs torch and no trainer: gradients of the objective, clipped, become an update."""
 
 import logging
-from collections.abc import Hashable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,14 +18,14 @@ from nerf_lightning.nerf.models.tiles import is_out_of_memory
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.groups import BuildOptimizer, optimizer_of
 from nerf_lightning.nerf.optimizers.schedule import Schedule
-from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, parts_of, sample_counts
+from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, parts_of
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.gradients.backward import Backward
-from nerf_lightning.training.gradients.recorded import RecordedGradients, Recorder, cuda_graph, require_replays
+from nerf_lightning.training.gradients.recorded import RecordedGradients, Recorder, cuda_graph
 from nerf_lightning.training.gradients.tiles import Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 
@@ -55,6 +55,7 @@ class TrainStep:
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
         jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
             evaluation, so that steps differ in their pixels alone.
+        records: tells whether to record steps where the weights are now, and to replay them; None: no.
 
     Raises:
         InputError: several rays a pixel, and a loss that looks at single rays.
@@ -73,11 +74,13 @@ class TrainStep:
         start_weights: dict[str, Tensor] | None = None,
         num_steps: int | None = None,
         jitter: bool = True,
+        records: Callable[["TrainStep"], bool] | None = None,
     ):
         self.objective, self.build_optimizer, self.schedule = objective, optimizer, schedule
         self.progress, self.num_steps, self.seed = progress, num_steps, seed
         self.clip_norm, self.sample_budget, self.start_weights = clip_norm, sample_budget, start_weights
         self.tiles, self.guard = TileGradients(objective, tile_points, jitter), StepGuard()
+        self.records = records
         self.recorded: RecordedGradients | None = None
         model, loss = objective.model, objective.loss
         for part in model.modules():
@@ -111,7 +114,8 @@ class TrainStep:
             seen = self.gradients(batch, backward, share)
             ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
             ranks.add_up_gradients(self.objective.parameters())
-            if self._guards_in_recording or self.guard.allows(seen.losses, self._named_parameters()):
+            guarded = self.recorded is not None and self.recorded.guards
+            if guarded or self.guard.allows(seen.losses, self.objective.named_weights()):
                 if measure_gradients:
                     seen = replace(seen, gradient_norms=self.model.gradient_norms())
                 self._update(optimizer)
@@ -167,29 +171,22 @@ class TrainStep:
                 wanted = self.sample_budget / self.model.points_per_ray(training=True)
                 progress.batch_rays = batch_size(progress.largest_batch, wanted, self.objective.together)
 
+    def begin_recording(self) -> None:
+        """Record steps from now on, where that was asked for and is possible.
+
+        Raises:
+            InputError: it was asked for, and something here decides on the host what a step computes.
+        """
+        if self.recorded is None and self.records is not None and self.records(self):
+            self.record_gradients()
+
     def record_gradients(self, record: Recorder = cuda_graph) -> None:
         """Record the way forward and back of batches, whole, and replay it from now on.
 
         Raises:
             InputError: something here decides on the host what a step computes.
         """
-        require_replays(self.objective)
-
-        def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
-            seen = self.tiles.in_tiles_of(batch.num_rays, batch, self._share(weight), key)
-            if self._guards_in_recording:
-                self.guard.keep_finite(seen.losses, self._named_parameters())
-            return seen
-
-        def counts() -> list[Tensor]:
-            return [*sample_counts(self.objective), *self.guard.tensors(self.device)]
-
-        parameters, parts = list(self.objective.parameters()), list(parts_of(self.objective))
-
-        def variant() -> tuple[Hashable, ...]:
-            return tuple(part.step_variant for part in parts)
-
-        self.recorded = RecordedGradients(compute, parameters, counts, variant, record)
+        self.recorded = RecordedGradients(self.tiles, self.guard, self._share, record)
 
     def forget_recordings(self) -> None:
         """Free the memory of all recordings; a further step makes new ones, of where everything lies then."""
@@ -262,12 +259,7 @@ class TrainStep:
 
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
-        return first_not_finite(self._named_parameters())
-
-    @property
-    def _guards_in_recording(self) -> bool:
-        # Several processes add up their gradients first.
-        return self.recorded is not None and ranks.world_size() == 1
+        return first_not_finite(self.objective.named_weights())
 
     @property
     def _key(self) -> int:
@@ -277,6 +269,3 @@ class TrainStep:
         """Return this process's part of the batch, given the sum of the weights of all of it."""
         num_rays, together = self.progress.batch_rays, self.objective.together
         return Share(ranks.share(num_rays // together).start * together, num_rays, weight)
-
-    def _named_parameters(self) -> list[tuple[str, Tensor]]:
-        return [(name.removeprefix("model."), each) for name, each in self.objective.named_parameters()]

@@ -78,17 +78,19 @@ class RadianceFieldSystem(LightningModule):
         return self.step.new_optimizer()
 
     def on_fit_start(self) -> None:
-        """Take the length of the run from the trainer, before any callback reads it or changes it.
+        """Take the length of the run from the trainer, and record its steps where that was asked for and is possible.
 
         Raises:
-            InputError: it has none, or the trainer cannot fit this system.
+            InputError: it has none, the trainer cannot fit this system, or its steps cannot be recorded.
         """
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
+        self.step.begin_recording()
         self.in_a_row = StepsInARow(self.trainer, self)
 
     def on_fit_end(self) -> None:
-        """Forget the trainer: copies and pickles of the system are without it."""
+        """Forget the trainer and what was recorded: copies and pickles of the system are without them."""
         del self.in_a_row
+        self.step.recorded = None
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.

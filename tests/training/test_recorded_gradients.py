@@ -9,6 +9,7 @@ import torch
 from support.gpu_training import step_by_step
 from support.tape import tape
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import NoCorrection
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
@@ -66,6 +67,15 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
     assert sorted(size for size, _ in run.training.recorded.recordings) == [32, 48]
+
+
+def test_each_of_several_processes_records_its_share(monkeypatch):
+    monkeypatch.setattr(ranks, "world_size", lambda: 2)
+    monkeypatch.setattr(ranks, "add_up", lambda tensors: None)  # the other one has nothing to add
+    monkeypatch.setattr(ranks, "from_first", lambda make: make())
+    run = trained([48] * 3, record=True)
+    assert_same(run, trained([48] * 3, record=False))
+    assert [size for size, _ in run.training.recorded.recordings] == [24]
 
 
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():

@@ -134,9 +134,8 @@ def prepare(config: DictConfig, scene: Scene) -> Bench:
     settings.prepare(step.model)
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.objective.loss.patch)
     data.settle(settings.device)
-    if settings.records(step):
-        step.record_gradients()
-    elif settings.measures_tile:
+    step.begin_recording()
+    if step.recorded is None and settings.measures_tile:
         settings.tile_points = step.tiles.points = measured_tile(settings, step, data.batches)[0]
     optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
     return Bench(settings, step, data, optimizer, plain)
