@@ -14,7 +14,7 @@ from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
-from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
 from nerf_lightning.nerf.kernels.ragged.integrate import integrate

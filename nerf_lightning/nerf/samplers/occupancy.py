@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
-from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
