@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import (
+from nerf_lightning.nerf.kernels.render.op import (
     LEARNING,
     RENDERING,
     has_kernel,
@@ -14,6 +13,7 @@ from nerf_lightning.nerf.kernels.render.whole_rays import (
     render_whole_rays,
     takes_samples,
 )
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
 from nerf_lightning.nerf.part import StepContext

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, add_all, defer_table_grads
+from nerf_lightning.nerf.kernels.hash_grid.op import TableGradient, add_all, defer_table_grads
 from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.types.step_output import StepOutput
 

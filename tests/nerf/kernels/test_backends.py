@@ -15,7 +15,7 @@ from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.adam.step import adam_step
+from nerf_lightning.nerf.kernels.adam.op import adam_step
 
 
 @pytest.fixture

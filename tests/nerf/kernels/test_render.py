@@ -13,7 +13,7 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import gradients as kernels
 from nerf_lightning.nerf.kernels.render import workspace
-from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
+from nerf_lightning.nerf.kernels.render.op import has_kernel
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random

@@ -6,7 +6,7 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from support.static_models import fast_model
 
-from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
+from nerf_lightning.nerf.kernels.ragged.op import num_visible
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
