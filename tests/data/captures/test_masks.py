@@ -45,7 +45,7 @@ class PlainMean(MeanSquaredError):
 def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(tile_points):
     model = tiny_model(density_bias=0.5)
     plain_step = make_step(tile_points, copy.deepcopy(model))
-    plain_step.loss = PlainMean()
+    plain_step.objective.loss = PlainMean()
     plain, losses = gradients(plain_step, ball_scene())
     weighted, weighted_losses = gradients(make_step(tile_points, copy.deepcopy(model)), ball_scene())
     assert torch.equal(weighted, plain)
