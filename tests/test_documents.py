@@ -144,7 +144,7 @@ def test_the_loss_in_a_file_of_ones_own_trains(tmp_path, monkeypatch):
     small = ("scene=npz", f"scene.path={capture}", "model=nerf_tiny", "data.batch_rays=32", "data.val_rays=32")
     run = build_run(*small, "loss._target_=my_losses.L1")
     Trainer(max_steps=3, accelerator="cpu", logger=False, default_root_dir=tmp_path).fit(run.system, run.data)
-    assert type(run.system.step.loss).__name__ == "L1"
+    assert type(run.system.step.objective.loss).__name__ == "L1"
     assert run.system.step.progress.step == 3
 
 

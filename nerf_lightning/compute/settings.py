@@ -18,7 +18,7 @@ from nerf_lightning.compute.devices import (
     working_device,
 )
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.matmul_precision import MatmulPrecision
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.models.base import Model
 
 Launcher = Literal["nerf", "torchrun", "slurm"]
@@ -82,7 +82,7 @@ class ComputeSettings:
     def prepare(self, model: Model) -> Model:
         """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
         self.precision, self.reason = suited(*self._chosen, self.device_type, model)
-        model.set_precision(PRODUCTS[self.precision])
+        set_precision(model, PRODUCTS[self.precision])
         return model.to(self.device)
 
     def describe(self) -> str:

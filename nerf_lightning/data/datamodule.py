@@ -10,10 +10,10 @@ from lightning.pytorch import LightningDataModule
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.machine import free_memory, require_memory
 from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_device
-from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, WholeViews
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches, WholeViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.progress import BATCH_SIZES, Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 

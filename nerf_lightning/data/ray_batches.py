@@ -26,27 +26,6 @@ from nerf_lightning.nerf.types.rays import Batch, PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.nerf.types.tensor_struct import concatenate
 
-BATCH_SIZES = 8
-
-
-def batch_sizes(largest: int) -> list[int]:
-    """Return the sizes that batches may have, the largest first: it, its half, its quarter, ...
-
-    >>> batch_sizes(4096)
-    [4096, 2048, 1024, 512, 256, 128, 64, 32]
-    """
-    return [max(1, largest >> number) for number in range(BATCH_SIZES)]
-
-
-def batch_size(largest: int, wanted: float, together: int = 1) -> int:
-    """Return the largest of `batch_sizes` that is at most `wanted`, and a multiple of `together`, as `largest` is.
-
-    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, together=256)
-    (1024, 4096, 32, 256)
-    """
-    sizes = [size for size in batch_sizes(largest) if size % together == 0]
-    return next((size for size in sizes if size <= wanted), sizes[-1])
-
 
 class PixelDomain:
     """The pixels of some views, or of their centers, numbered from 0; row by row, view by view.

@@ -10,15 +10,16 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.models.tiles import pixels_in_tile, tiles
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.rays import Batch, PixelIndex
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene
 
 NUM_STEPS = 60
@@ -41,8 +42,8 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
     rays_of = RayGenerator(scene.cameras[view : view + 1], near, far, motion).to(device)
     optimizer = torch.optim.Adam(motion.parameters(), lr=FIRST_RATE)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_RATE / FIRST_RATE) ** (1.0 / NUM_STEPS))
-    rgba, behind = scene.pixels.view(view), background_colors(background, 1, torch.device("cpu"), random=None)
-    kept = scene.pixels.kept(view)
+    objective = Objective(model, rays_of, MeanSquaredError(), background)
+    rgba, kept = scene.pixels.view(view), scene.pixels.kept(view)
     shown = None if kept is None or not bool(kept.any()) else kept.flatten().nonzero()[:, 0]
     count, width = rgba[..., 0].numel() if shown is None else len(shown), rgba.shape[1]
     draw = torch.Generator().manual_seed(view)
@@ -52,8 +53,13 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
             number = number if shown is None else shown[number]
             x, y = number % width, number // width
             optimizer.zero_grad()
-            seen, truth = PixelIndex(torch.zeros_like(x), x, y).to(device), blend(rgba[y, x].float() / 255.0, behind)
-            _add_gradients(model, rays_of, seen, truth.to(device), background, tile_points)
+            pixels = PixelIndex(torch.zeros_like(x), x, y)
+            batch = Batch(pixels, rgba[y, x].float() / 255.0, torch.ones(len(x))).to(device)
+            for part in tiles(len(x), pixels_in_tile(model, tile_points, training=True)):
+                renderings, target = objective.neutral(batch[part])
+                (
+                    objective.loss(renderings[-1:], target)["color"].sum() * ((part.stop - part.start) / len(x))
+                ).backward()
             optimizer.step()
             decay.step()
     c2w = scene.cameras.c2w.clone()
@@ -61,21 +67,11 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
     return replace(scene.cameras, c2w=c2w)
 
 
-def _add_gradients(
-    model: Model, rays_of: RayGenerator, pixels: PixelIndex, truth: Tensor, background: Background, tile_points: int
-) -> None:
-    count = truth.shape[0]
-    behind = background_colors(background, count, truth.device, random=None)
-    for part in tiles(count, tile_rays_for(model, tile_points, training=True)):
-        rendering = model(rays_of(pixels[part]), None if behind is None else behind[part], random=None)[-1]
-        ((rendering.rgb - truth[part]).square().sum() / truth.numel()).backward()
-
-
 @contextmanager
 def _frozen(model: Model) -> Iterator[None]:
     """Let a model learn nothing and count nothing meanwhile."""
     learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    counts = [count.clone() for count in model.sample_counts()]
+    counts = [count.clone() for count in sample_counts(model)]
     try:
         for parameter in learning:
             parameter.requires_grad_(False)
@@ -83,5 +79,5 @@ def _frozen(model: Model) -> Iterator[None]:
     finally:
         for parameter in learning:
             parameter.requires_grad_(True)
-        for count, before in zip(model.sample_counts(), counts, strict=True):
+        for count, before in zip(sample_counts(model), counts, strict=True):
             count.copy_(before)

@@ -3,7 +3,6 @@
 Papers average the PSNR of each image. Pooling the squared error over images first gives a lower number.
 """
 
-import math
 import statistics
 from collections.abc import Sequence
 
@@ -12,10 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from nerf_lightning.compute import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected, is_one_color
 from nerf_lightning.nerf.matmul_precision import disable_autocast
-from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
+from nerf_lightning.nerf.psnr import picture_psnr
 from nerf_lightning.nerf.row_chunks import row_chunks
 
 SSIM_WINDOW = 11
@@ -102,29 +100,3 @@ def _columns(per_image: Sequence[dict[str, float | None]]) -> dict[str, list[flo
     columns = {name: [image[name] for image in per_image] for name in per_image[0]}
     known = {name: [value for value in values if value is not None] for name, values in columns.items()}
     return {name: known[name] if len(known[name]) == len(columns[name]) else None for name in columns}
-
-
-class RayErrors:
-    """Collect squared errors of rays, batch by batch, and summarize them over all processes of a run."""
-
-    def __init__(self) -> None:
-        self.parts: list[Tensor] = []
-
-    def add(self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]) -> None:
-        """Take note of some rays; those of weight 0 do not count."""
-        self.parts.append(torch.stack([(rgb - target).square().mean(dim=-1), weight]))
-
-    def summary(self) -> dict[str, float]:
-        """Return the PSNR of all rays and its standard error (delta method), and begin anew."""
-        # Masked on the host: on XLA a size that depends on data stops the device.
-        error, weight = torch.cat(self.parts, dim=-1).cpu()
-        self.parts.clear()
-        error = error[weight > 0].double()
-        moments = torch.stack([torch.ones_like(error).sum(), error.sum(), error.square().sum()])
-        count, first, second = ranks.total(moments)
-        mean = first / count
-        standard_error = ((second / count - mean.square()).clamp(min=0) / (count - 1).clamp(min=1)).sqrt()
-        return {
-            "val/psnr": float(psnr(mean)),
-            "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean.clamp(min=LEAST_MSE)),
-        }

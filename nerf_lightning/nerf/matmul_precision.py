@@ -2,7 +2,7 @@
 
 torch lowers every float32 product inside `torch.autocast`, and on NVIDIA GPUs wherever TensorFloat-32 is allowed. A
 pose that is multiplied in bfloat16 is wrong by half a percent. So this program opens neither: a field is given the
-precision of the products with its weights (`Field.set_precision`), and every other function that multiplies matrices is
+precision of the products with its weights (`set_precision`), and every other function that multiplies matrices is
 marked `disable_autocast`, which holds even where somebody else has opened autocast around it.
 """
 
@@ -67,6 +67,13 @@ def linear(
         return functional.linear(features, weight, bias)
     out = _tf32_product(features, weight.t())
     return out if bias is None else out + bias
+
+
+def set_precision(module: nn.Module, matmul_precision: MatmulPrecision) -> None:
+    """Set the precision of the products with the weights within a module; everything else is float32 always."""
+    for part in module.modules():
+        if hasattr(part, "matmul_precision"):
+            part.matmul_precision = matmul_precision  # type: ignore[assignment]
 
 
 class Linear(nn.Linear):

@@ -1,10 +1,16 @@
-"""The contract of every part that learns, inside the model or beside it: learning rate, penalty, a hook each step."""
+"""The contract of every part that learns, inside the model or beside it: what training asks of it, and tells it.
 
-from collections.abc import Iterator
+A hook speaks for the part itself and not for the parts within, which training finds by a walk over modules: a part may
+sit anywhere, and nothing has to hand a hook down. Only `reset_parameters` is for all that lies within.
+"""
+
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from nerf_lightning.nerf.types.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -20,24 +26,61 @@ class StepContext:
 
 
 class Part(nn.Module):
-    """A module that training asks for its learning rate and penalty, and tells of each step.
+    """A module that training asks for its learning rate and penalty, and tells of the scene and of each step.
 
-    Encoders, fields, samplers, cameras and corrections are parts. All that a step needs of them is found by a walk over
-    modules, so a part may sit anywhere.
+    Models, levels, samplers, fields, encoders, cameras, corrections and losses are parts.
     """
 
     learning_rate: float | None = None
     """Initial rate of all its parameters; the run's schedule scales it, and they do not decay. None: the run's."""
 
+    replays: bool = True
+    """Whether it takes the same kernels in each step of one `step_variant`, so that a recording (trainer.cuda_graph)
+    of one may be replayed for others. A part of your own is taken at its word where its own class says so; else it is
+    recorded only where that is asked for. What such a step changes in buffers are `sample_counts` alone."""
+
+    step_variant: Hashable = None
+    """What the host has decided for the next step, which changes what kernels it takes."""
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
+
     def on_step(self, context: StepContext) -> None:
-        """Prepare for the next step of training."""
+        """Prepare for the next step of training; the parts within have done so."""
 
     def penalty(self) -> Float[Tensor, ""] | None:
         """Return what is added to the loss of each step, once, however the step is cut; None: nothing."""
         return None
 
+    def sample_counts(self) -> list[Tensor]:
+        """Return the buffers in which a training step counts, to put them back where a step is repeated."""
+        return []
+
+    def buffers_to_average(self) -> list[Tensor]:
+        """Return the buffers that hold means over rays, which the processes of a run must agree on."""
+        return []
+
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training."""
+        return {}
+
+    def reset_statistics(self) -> None:
+        """Forget what was counted while rendering."""
+
+    def validate_state(self) -> None:
+        """Check what was loaded.
+
+        Raises:
+            InputError: it holds what it never can.
+        """
+
     def reset_parameters(self) -> None:
-        """Set the parameters to where a new attempt begins; nothing to do where there are none."""
+        """Begin a new attempt: draw all parameters anew from torch's generator, and forget what was learned otherwise.
+
+        By default the parts within do so, in their order.
+        """
+        for part in _nearest_parts(self):
+            part.reset_parameters()
 
 
 def parts_of(*modules: nn.Module) -> Iterator[Part]:
@@ -48,3 +91,39 @@ def parts_of(*modules: nn.Module) -> Iterator[Part]:
             if isinstance(part, Part) and id(part) not in known:
                 known.add(id(part))
                 yield part
+
+
+def _nearest_parts(module: nn.Module) -> Iterator[Part]:
+    """Return the parts within a module that lie in no other part within it."""
+    for child in module.children():
+        if isinstance(child, Part):
+            yield child
+        else:
+            yield from _nearest_parts(child)
+
+
+def fit_parts(module: nn.Module, scene: Scene) -> None:
+    """Let every part within a module take note of the scene."""
+    for part in parts_of(module):
+        part.fit_to(scene)
+
+
+def begin_step(module: nn.Module, context: StepContext) -> None:
+    """Let every part within a module prepare for a step, inner parts first: a level's grid asks its field."""
+    for part in reversed(list(parts_of(module))):
+        part.on_step(context)
+
+
+def sample_counts(module: nn.Module) -> list[Tensor]:
+    """Return the buffers in which a training step counts."""
+    return [count for part in parts_of(module) for count in part.sample_counts()]
+
+
+def buffers_to_average(module: nn.Module) -> list[Tensor]:
+    """Return the buffers that hold means over rays."""
+    return [mean for part in parts_of(module) for mean in part.buffers_to_average()]
+
+
+def statistics(module: nn.Module) -> dict[str, float]:
+    """Return what is worth watching while training."""
+    return {name: value for part in parts_of(module) for name, value in part.statistics().items()}

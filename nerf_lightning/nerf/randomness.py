@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import backend_for, cpu_backend
+from nerf_lightning.nerf.kernels.random import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Word = TypeVar("Word", int, Tensor)
@@ -67,10 +68,7 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
-        kernels = backend_for("random", self.slots.device) if self.slots.dim() == 1 else None
-        if kernels is not None:
-            return kernels.uniform(self.key, self.slots, purpose_word(purpose), count)
-        return self.along(count).uniform(purpose)
+        return _uniform(self.key, self.slots, purpose_word(purpose), count)
 
     def normal(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` standard normal numbers per ray."""
@@ -95,14 +93,26 @@ class PointRandom(TensorStruct):
 
     def uniform(self, purpose: str) -> Float[Tensor, "*points"]:
         """Return a number for each point, uniform on [0, 1), in steps of 2^-24."""
-        ray = mix(self.key ^ purpose_word(purpose)) ^ mix(self.slots & WORD)
-        words = mix((mix(ray) + self.number * 0x3C6EF35F) & WORD)
-        return (words >> 8).to(torch.float32) * 2.0**-24
+        return _hashed(self.key, self.slots, self.number, purpose_word(purpose))
 
     def normal(self, purpose: str) -> Float[Tensor, "*points"]:
         """Return a standard normal number for each point (Box and Muller, 1958)."""
         radius = torch.sqrt(-2.0 * torch.log1p(-self.uniform(purpose)))
         return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle"))
+
+
+def _hashed(key: Tensor, slots: Tensor, number: Tensor, word: int) -> Tensor:
+    ray = mix(key ^ word) ^ mix(slots & WORD)
+    words = mix((mix(ray) + number * 0x3C6EF35F) & WORD)
+    return (words >> 8).to(torch.float32) * 2.0**-24
+
+
+@with_kernel(op.uniform)
+def _uniform(
+    key: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], word: int, count: int
+) -> Float[Tensor, "*rays {count}"]:
+    number = torch.arange(count, device=slots.device).expand(*slots.shape, count)
+    return _hashed(key[..., None], slots[..., None], number, word)
 
 
 def batch_random(
@@ -113,6 +123,7 @@ def batch_random(
     return RayRandom(key=key.expand_as(slots) if isinstance(key, Tensor) else torch.full_like(slots, key), slots=slots)
 
 
+@with_kernel(op.permute)
 def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:
     """Return where a keyed permutation of range(size) sends each index; nothing is stored, any size is allowed.
 
@@ -124,9 +135,6 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     True
     """
     rows, columns = grid_of(size)
-    kernels = cpu_backend("random.cpu", index.device) if key.numel() == 1 and index.dim() == 1 else None
-    if kernels is not None:
-        return kernels.permute(index, rows, columns, size, _round_words(int(key)))
     position = _feistel(index, rows, columns, key)
     while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
         position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
@@ -142,7 +150,7 @@ def grid_of(size: int) -> tuple[int, int]:
 def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
     row = index // columns
     column = index - row * columns
-    for number, round_key in enumerate(_round_words(key)):
+    for number, round_key in enumerate(round_words(key)):
         if number % 2:
             column = (column + mix(round_key ^ row)) % columns
         else:
@@ -150,6 +158,7 @@ def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
     return row * columns + column
 
 
-def _round_words(key: Word) -> list[Word]:
+def round_words(key: Word) -> list[Word]:
+    """Return a word for each round of a permutation."""
     # As many words as there are keys: a batch that lies in one epoch has one.
     return [mix((key + number * 0x1B873593) & WORD) for number in range(FEISTEL_ROUNDS)]

@@ -74,8 +74,7 @@ class StepwiseRun(Run):
         step, batches, optimizer = self.system.step, self.data.batches, self.optimizer
         step.num_steps = until
         self.data.settle(step.device)
-        if self.settings.records(step) and not step.records:
-            step.record_gradients()
+        step.begin_recording()
         rays = iter(batches)
         while self.num_steps < until:
             self.system.train()

@@ -10,14 +10,14 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, CUDA_BACKENDS
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
-from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
-from nerf_lightning.nerf.kernels.ragged.integrate import integrate
+from nerf_lightning.nerf.kernels.mlp.op import mlp, mlp_torch
+from nerf_lightning.nerf.kernels.ragged.op import integrate
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS, MatmulPrecision
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle

@@ -9,15 +9,15 @@ from torch import Tensor
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
-from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
-from nerf_lightning.nerf.matmul_precision import MatmulPrecision
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.check import Check, gradient_bound, norm_apart
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.validation import RayErrors
 
 SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
 ENCODER = (
@@ -56,7 +56,7 @@ class Training:
         settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
         self.step = build_step(config, settings, scene, progress).to(device)
         self.step.num_steps = STEPS
-        self.step.model.set_precision(matmul_precision)
+        set_precision(self.step.model, matmul_precision)
         self.loader = RayBatches(on_device(scene, device), progress, SEED, BATCH_RAYS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
         self.optimizer = self.step.new_optimizer()
@@ -79,7 +79,7 @@ class Training:
             step(self.loader.at(0, step.progress.rays_seen).to(step.device), self.optimizer)
         with torch.no_grad():
             for batch in self.held_out:
-                step.validate(batch.to(step.device), errors)
+                errors.of(step.objective, batch.to(step.device), step.tiles.points)
         if step.guard.skipped:
             raise ValueError(f"{step.guard.skipped} of {STEPS} steps had gradients that are not finite")
         return errors.summary()["val/psnr"]

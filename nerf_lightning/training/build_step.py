@@ -14,6 +14,8 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
@@ -65,25 +67,24 @@ def build_step(
     if settings.device_type == "cpu":
         taken = model.kernels()
         compile_kernels([f"{KERNELS}.{name}" for name in CPU_BACKENDS if name in taken])
-    model.fit_to(scene)
+    fit_parts(model, scene)
     show_photographs(model, scene)
     correction: Correction = build(config.correction)
     correction.fit_to(scene)
     if start is not None:
         start.load_weights(model)
+    loss = build(config.loss) if loss is None else loss
+    rays = RayGenerator.of_views(scene, model, refinement)
     return TrainStep(
-        model=model,
-        rays=RayGenerator.of_views(scene, model, refinement),
-        loss=build(config.loss) if loss is None else loss,
-        correction=correction,
+        objective=Objective(model, rays, loss, scene.background, correction),
         optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,
         seed=config.seed,
-        background=scene.background,
         tile_points=settings.tile_points,
         clip_norm=settings.clip_norm,
         sample_budget=config.data.sample_budget,
         start_weights=None if start is None else start.weights,
         jitter=config.data.overfit_views is None,
+        records=settings.records_there,
     )

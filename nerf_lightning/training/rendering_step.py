@@ -9,6 +9,7 @@ from nerf_lightning.config.load_model import load_model
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
@@ -30,14 +31,11 @@ def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Train
     scene, model, settings = checkpoint.scene, load_model(checkpoint, trusted), ComputeSettings(accelerator="cpu")
     settings.keep_tile(checkpoint.tile_points)
     return TrainStep(
-        model=model,
-        rays=RayGenerator.of_views(scene, model),
-        loss=MeanSquaredError(),
+        objective=Objective(model, RayGenerator.of_views(scene, model), MeanSquaredError(), scene.background),
         optimizer=no_optimizer,
         schedule=ExponentialDecay(),
         progress=Progress(),
         seed=0,
-        background=scene.background,
         tile_points=settings.tile_points,
         start_weights=checkpoint.weights,
     )

@@ -16,9 +16,8 @@ from torch.optim import Optimizer
 from nerf_lightning.checkpoints.format import KEY, LOOPS, require_training_state
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import use_threads
-from nerf_lightning.data.ray_batches import batch_sizes
 from nerf_lightning.files.trust import Mismatch, reading, require_fit
-from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.progress import Progress, batch_sizes
 from nerf_lightning.training.step import TrainStep
 
 CURE = (
@@ -39,7 +38,7 @@ def run_state(step: TrainStep) -> dict[str, Any]:
     return {
         "progress": asdict(step.progress),
         "bad_steps": step.guard.state(),
-        "tile_points": step.tile_points,
+        "tile_points": step.tiles.points,
         "num_threads": torch.get_num_threads(),
         "world_size": ranks.world_size(),
     }

@@ -64,11 +64,12 @@ def assemble(
     step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
         log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
-    if step.loss.depth_every:
+    loss = step.objective.loss
+    if loss.depth_every:
         record["depths"] = depth_sums(scene)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(
-        scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch, depth_every=step.loss.depth_every
+        scene=scene, progress=progress, seed=config.seed, patch=loss.patch, depth_every=loss.depth_every
     )
     if ranks.is_first():
         build(config.quick_checks)(scene)

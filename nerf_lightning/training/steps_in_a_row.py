@@ -53,7 +53,7 @@ class StepsInARow:
         # Lightning would compare with the batches that it has fetched.
         ends = epoch.batch_progress.is_last_batch = epoch.batch_progress.current.ready >= trainer.num_training_batches
         validates = (epoch.total_batch_idx + 1) % val_every == 0
-        if ends or validates or taken == MOST or trainer.should_stop or not self.system.step.records:
+        if ends or validates or taken == MOST or trainer.should_stop or not self.system.step.recorded:
             return False
         return not any(is_due(trainer, self.system) for is_due in self.asked)
 

@@ -13,20 +13,21 @@ from torch.optim import Optimizer
 from nerf_lightning.checkpoints.format import KEY, LOOPS
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, read_content
 from nerf_lightning.checkpoints.same_capture import require_same_capture
-from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
+from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.resume import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
-from nerf_lightning.training.step_output import StepOutput
 from nerf_lightning.training.steps_in_a_row import StepsInARow, logs_for
+from nerf_lightning.training.validation import RayErrors
 
 
 class RadianceFieldSystem(LightningModule):
@@ -46,7 +47,9 @@ class RadianceFieldSystem(LightningModule):
         self.automatic_optimization = False
         self.step, self.record, self.resume_changed_capture = step, record, resume_changed_capture
         # Modules of the step are this module's, so that they move to the trainer's device and are saved.
-        self.model, self.rays, self.correction, self.loss = step.model, step.rays, step.correction, step.loss
+        objective = step.objective
+        self.model, self.rays = objective.model, objective.rays
+        self.correction, self.loss = objective.correction, objective.loss
         self.val_errors = RayErrors()
 
     @classmethod
@@ -75,17 +78,19 @@ class RadianceFieldSystem(LightningModule):
         return self.step.new_optimizer()
 
     def on_fit_start(self) -> None:
-        """Take the length of the run from the trainer, before any callback reads it or changes it.
+        """Take the length of the run from the trainer, and record its steps where that was asked for and is possible.
 
         Raises:
-            InputError: it has none, or the trainer cannot fit this system.
+            InputError: it has none, the trainer cannot fit this system, or its steps cannot be recorded.
         """
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
+        self.step.begin_recording()
         self.in_a_row = StepsInARow(self.trainer, self)
 
     def on_fit_end(self) -> None:
-        """Forget the trainer: copies and pickles of the system are without it."""
+        """Forget the trainer and what was recorded: copies and pickles of the system are without them."""
         del self.in_a_row
+        self.step.recorded = None
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
@@ -114,7 +119,7 @@ class RadianceFieldSystem(LightningModule):
 
     def validation_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Collect the squared error of fixed rays; return its mean over the batch as `loss`, and the `psnr` (dB)."""
-        loss = self.step.validate(batch, self.val_errors)
+        loss = self.val_errors.of(self.step.objective, batch, self.step.tiles.points)
         return {"loss": loss, "psnr": psnr(loss)}
 
     def on_validation_epoch_end(self) -> None:
@@ -138,7 +143,7 @@ class RadianceFieldSystem(LightningModule):
             InputError: the batch is no whole view.
         """
         picture = self.predict_step(batch, batch_index)
-        behind = background_colors(self.step.background, 1, torch.device("cpu"), random=None)
+        behind = background_colors(self.step.objective.background, 1, torch.device("cpu"), random=None)
         kept = batch.weight.cpu() > 0
         values = image_metrics(picture.rgb, blend(batch.rgba.cpu(), behind), None if bool(kept.all()) else kept)
         known = {name: value for name, value in values.items() if value is not None}
@@ -157,8 +162,8 @@ class RadianceFieldSystem(LightningModule):
                 "Trainer.predict datamodule=run.data, or its test_dataloader()."
             )
         view = int(batch.pixels.view[0, 0])
-        tile_points = self.step.tile_points or WHOLE_BATCH_POINTS
-        return render_picture(self.model, self.rays, view, self.step.background, tile_points)
+        tile_points = self.step.tiles.points or WHOLE_BATCH_POINTS
+        return render_picture(self.model, self.rays, view, self.step.objective.background, tile_points)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what makes the file self-contained, and the run's state beyond weights and optimizer.

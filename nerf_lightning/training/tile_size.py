@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.models.sample_counter import average_counts
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -68,7 +69,7 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> tuple[int,
 
 def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> int:
     _seconds(settings, step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
-    step.model.update(0, 0)  # how many samples rays have is known from here on
+    average_counts(step.model)  # how many samples rays have is known from here on
     # Grown, not extrapolated: a tile of few rays says little of one of many, and too few rays make all tiles alike.
     rays = min(batch.num_rays, 4 * FEW_RAYS)
     seconds = _seconds(settings, step, batch, rays, CPU_TILES[0])
@@ -79,6 +80,6 @@ def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> i
 
 
 def _seconds(settings: TrainerSettings, step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
-    step.tile_points = tile
+    step.tiles.points = tile
     some = batch[:num_rays]
     return seconds_of(lambda: step.gradients(some))

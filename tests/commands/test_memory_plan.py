@@ -61,7 +61,7 @@ def built():
     progress = Progress()
     step = build_step(config, settings, scene, progress)
     settings.prepare(step.model)
-    step.tile_points, step.num_steps = TILE, 10
+    step.tiles.points, step.num_steps = TILE, 10
     return step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 
@@ -73,7 +73,7 @@ def warm(step, batches):
         step.model(step.rays(few.pixels), None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
     step.reset_statistics()
-    step.model.update(0, 0)
+    average_counts(step.model)
 
 
 def train():

@@ -178,7 +178,7 @@ def test_tiles_add_up_with_distances():
     found = []
     for tile_points in (None, 200):
         step = make_step(tile_points)
-        step.loss = DepthLoss(every=4)
+        step.objective.loss = DepthLoss(every=4)
         batch = RayBatches(scene_with_depths(), step.progress, 0, 64, depth_every=4).at(0, 0)
         found.append(step.gradients(batch).losses)
     assert float(found[0][-1]) > 0

@@ -5,13 +5,13 @@ import torch
 
 from nerf_lightning.evaluation.metrics import (
     SSIM_WINDOW,
-    RayErrors,
     image_metrics,
     mean_over_images,
     median_over_images,
-    psnr,
     worst_of_images,
 )
+from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.training.validation import RayErrors
 
 
 def pair(mse, size=16):

@@ -6,8 +6,8 @@ from support.triton_perceptron import check_perceptron
 from support.triton_twin import check_against_the_reference
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.selftest import kernels
 from nerf_lightning.selftest.check import carried_out
 
@@ -72,6 +72,6 @@ def test_where_triton_does_not_compile_plain_torch_does_its_work(device, generat
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.rand(500, 3, generator=generator)
     expected = interpolate(table.double(), points.double(), layout)
-    monkeypatch.setattr("nerf_lightning.nerf.kernels.hash_grid.interpolate.cuda_backend", lambda *given: None)
+    monkeypatch.setattr("nerf_lightning.nerf.kernels.hash_grid.op.cuda_backend", lambda *given: None)
     found = interpolate(table.to(device), points.to(device), layout)
     torch.testing.assert_close(found.cpu().double(), expected, rtol=0, atol=1e-4)

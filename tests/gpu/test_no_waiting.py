@@ -1,7 +1,7 @@
 """Within a step the host never waits for the GPU: no synchronisation, no copy to the host.
 
-What is read on the host, and when, by name: `RaggedLevel.update` every 16 steps (how many samples rays had, by which
-the tiles of the next step are cut; at its first time, which cells there are), `MaskedLevel.update` at its first time,
+What is read on the host, and when, by name: `RaggedLevel.on_step` every 16 steps (how many samples rays had, by which
+the tiles of the next step are cut; at its first time, which cells there are), `MaskedLevel.on_step` at its first time,
 `CollapseGuard` every 25 steps, `Monitor` every 50, `NanGuard` every 100.
 """
 

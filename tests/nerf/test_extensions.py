@@ -22,7 +22,9 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.part import fit_parts, statistics
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.video.film import film
@@ -45,10 +47,11 @@ ADDED = {
 def a_step(overrides) -> TrainStep:
     config, scene = composed("train", SEARCHED, *overrides), ball_scene(num_views=8, size=16, background="random")
     model = build(config.model)
-    model.fit_to(scene)
+    fit_parts(model, scene)
     return TrainStep(
-        model, rays_of(scene), build(config.loss), lambda groups: torch.optim.Adam(groups, lr=2e-2),
-        ExponentialDecay(decay_rate=1.0), Progress(), 0, "random", 4096, num_steps=100,
+        Objective(model, rays_of(scene), build(config.loss), "random"),
+        lambda groups: torch.optim.Adam(groups, lr=2e-2), ExponentialDecay(decay_rate=1.0), Progress(), 0, 4096,
+        num_steps=100,
     )  # fmt: skip
 
 
@@ -56,7 +59,7 @@ def a_step(overrides) -> TrainStep:
 def test_it_learns_renders_and_is_saved(added):
     scene = ball_scene(num_views=8, size=16, background="random")
     step = a_step(ADDED[added])
-    loader, optimizer = RayBatches(scene, step.progress, 0, 96, patch=step.loss.patch), step.new_optimizer()
+    loader, optimizer = RayBatches(scene, step.progress, 0, 96, patch=step.objective.loss.patch), step.new_optimizer()
     losses = [step(loader.at(0, step.progress.rays_seen), optimizer).losses[-1] for _ in range(35)]
     assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
     assert step.guard.skipped == 0
@@ -71,7 +74,7 @@ def test_the_penalty_of_an_encoder_inside_the_model_reaches_its_gradients_once(t
     scene, gradients = ball_scene(num_views=8, size=16, background="random"), []
     for weight in (0.0, 1.0):
         step = a_step([*ADDED["an encoder with a penalty"], f"encoder.total_variation={weight}"])
-        step.tile_points = tile_points
+        step.tiles.points = tile_points
         step.gradients(RayBatches(scene, step.progress, 0, 96).at(0, 0))
         gradients.append(step.model.last.field.position_encoder.planes.grad)
     encoder = step.model.last.field.position_encoder
@@ -125,7 +128,7 @@ def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
     with torch.no_grad():
         walked = step.model(rays, torch.ones(64, 3), None)[0]
     torch.testing.assert_close(walked.rgb, whole.rgb.detach(), atol=2e-3, rtol=0)
-    assert "train/occupied" not in step.model.statistics()
+    assert "train/occupied" not in statistics(step.model)
 
 
 def test_a_table_of_cameras_is_a_capture(tmp_path):

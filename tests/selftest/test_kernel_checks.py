@@ -8,7 +8,7 @@ from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.march import cpu as march_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
 from nerf_lightning.nerf.kernels.ragged import cpu as ragged_cpu
-from nerf_lightning.nerf.kernels.ragged import integrate as packed
+from nerf_lightning.nerf.kernels.ragged import op as packed
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.kernels import checks
 

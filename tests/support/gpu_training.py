@@ -11,6 +11,7 @@ from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
@@ -63,7 +64,7 @@ def step_by_step(
     for level in training.model.modules():
         if isinstance(level, RaggedLevel):
             level.sampler.opaque_below = 0.0  # GPUs cut off no samples, and the losses are compared
-    training.model.set_precision(PRODUCTS[precision])
+    set_precision(training.model, PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
     return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))
 

@@ -7,8 +7,9 @@ from support.scenes import ball_scene
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
-from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16, set_precision
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 needs_bfloat16 = pytest.mark.skipif(
@@ -23,7 +24,7 @@ def a_level(opaque_below=0.0, width=32, features=4, matmul_precision="float32", 
     field = NGPField(grid, SphericalHarmonicsEncoder(4), width=width, **settings)
     sampler = OccupancySampler(resolution=32, num_steps=100, opaque_below=opaque_below)
     level = RaggedLevel(sampler, field)
-    level.fit_to(ball_scene(num_views=12))
-    field.set_precision(matmul_precision)
+    fit_parts(level, ball_scene(num_views=12))
+    set_precision(field, matmul_precision)
     sampler.grid.occupy(torch.rand(sampler.grid.cells.shape) < 0.05)
     return level

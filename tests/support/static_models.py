@@ -11,8 +11,10 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.training.step import TrainStep
@@ -46,17 +48,14 @@ OPTIMIZERS = {
 def static_system(name: str, scene, progress, num_steps: int, model=None, loss=None) -> RadianceFieldSystem:
     """The system that trains one of the two models on whole batches."""
     model = model or MODELS[name]()
-    model.fit_to(scene)
+    fit_parts(model, scene)
     step = TrainStep(
-        model=model,
-        rays=rays_of(scene),
-        loss=loss or MeanSquaredError(),
+        objective=Objective(model, rays_of(scene), loss or MeanSquaredError(), scene.background),
         optimizer=OPTIMIZERS[name],
         schedule=ExponentialDecay(decay_rate=0.1),
         progress=progress,
         num_steps=num_steps,
         seed=0,
-        background=scene.background,
         clip_norm=1.0,
     )
     return RadianceFieldSystem(step, {"scene": {"splits": {"train": list(scene.splits["train"])}}})

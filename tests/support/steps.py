@@ -6,6 +6,7 @@ from support.scenes import ball_scene, tiny_model
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
@@ -29,15 +30,14 @@ def rays_of(scene) -> RayGenerator:
 def make_step(tile_points, model=None, background="white", clip_norm=None, seed=0, sample_budget=None):
     """The step of a tiny model on the ball, whose weights nothing moves."""
     return TrainStep(
-        model=model or tiny_model(density_bias=0.5),
-        rays=rays_of(ball_scene()),
-        loss=MeanSquaredError(),
+        objective=Objective(
+            model or tiny_model(density_bias=0.5), rays_of(ball_scene()), MeanSquaredError(), background
+        ),
         optimizer=NoUpdate,
         schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
         progress=Progress(),
         num_steps=100,
         seed=seed,
-        background=background,
         tile_points=tile_points,
         clip_norm=clip_norm,
         sample_budget=sample_budget,

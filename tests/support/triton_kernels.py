@@ -13,7 +13,7 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.adam.step import adam_step_torch
+from nerf_lightning.nerf.kernels.adam.op import adam_step_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
@@ -260,10 +260,10 @@ def in_double(field, rays, samples, colored, whole_from):
 @contextmanager
 def forced():
     """Let the quadrature be the one for CUDA, on whatever device."""
-    from nerf_lightning.nerf.kernels.ragged import cuda, integrate
+    from nerf_lightning.nerf.kernels.ragged import cuda, op
 
     with (
-        patch.object(integrate, "backend_for", lambda *given: cuda),
-        patch.object(integrate, "cuda_backend", lambda *given: cuda),
+        patch.object(op, "backend_for", lambda *given: cuda),
+        patch.object(op, "cuda_backend", lambda *given: cuda),
     ):
         yield

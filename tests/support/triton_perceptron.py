@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import torch
 
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp_torch
+from nerf_lightning.nerf.kernels.mlp.op import mlp_torch
 
 SIZES = [(32, 64, 16), (32, 64, 64, 3), (20, 40, 24, 5), (16, 16, 1)]
 

@@ -23,9 +23,9 @@ UPDATED = 4  # grids have been updated once
 TILE_POINTS = 128
 
 # At the first update the host reads which cells there are, and how large; it sends their numbers.
-CELLS = {"OccupancySampler.update": 3}
+CELLS = {"OccupancySampler.learn": 3}
 # At each update it asks whether samples were counted, and then how many a ray has, by which tiles are cut.
-TALLY = {"RaggedLevel.update": 2, "RaggedLevel.points_per_ray": 2}
+TALLY = {"RaggedLevel.on_step": 2, "RaggedLevel.points_per_ray": 2}
 # In each step it reads where rays come from, how many photographs shall be looked at, and whether there are any; and
 # which they are, since it is the host that holds them.
 SOURCES = {"choose_sources": 3 * (STEPS - WARM), "ViewTransformer._looked_up": 2 * (STEPS - WARM)}

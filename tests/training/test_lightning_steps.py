@@ -12,11 +12,13 @@ from lightning.pytorch.callbacks.progress.tqdm_progress import TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
 from support.running import FAST
+from support.tape import steps_on_tape
 
 import nerf_lightning as nl
 from nerf_lightning import RadianceFieldSystem, build_run
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.training.launch.trainer import TrainerSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists")
 WATCHED = [each for each in FAST if each.startswith(("model", "data"))]
@@ -135,3 +137,19 @@ def test_what_a_subclass_of_somebody_saves_is_opened(tmp_path):
         warnings.simplefilter("ignore")
         longer.fit(Theirs(again.system.step, again.system.record), again.data, ckpt_path=tmp_path / "theirs.ckpt")
     assert longer.global_step == 2
+
+
+def test_steps_of_a_trainer_of_ones_own_are_replayed(tmp_path):
+    losses, quietly = [], {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
+    for records in (False, True):
+        outputs = Outputs()
+        with steps_on_tape() as replays, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(TrainerSettings, "records", lambda settings, step, records=records: records)
+            run = made_run(tmp_path)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                quiet(max_steps=4, limit_val_batches=0, callbacks=[outputs], **quietly).fit(run.system, run.data)
+        assert len(replays) == 4 * records
+        assert run.system.step.recorded is None  # a system can be copied
+        losses.append(torch.stack(outputs.train))
+    assert torch.equal(*losses)

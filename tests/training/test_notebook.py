@@ -266,7 +266,7 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
     def with_learnt_cameras():
         made = run("scheduler=constant")
         cameras = made.scene.cameras, made.scene.near, made.scene.far
-        made.system.rays = made.system.step.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
+        made.system.rays = made.system.step.objective.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
         return made
 
     whole, rest, found = whole_and_resumed(with_learnt_cameras, trainer, stop=5, steps=12)

@@ -9,9 +9,9 @@ from support.wrong_cameras import mean_errors, with_noise
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.bricks.reader import BricksReader
-from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.build_step import build_step
@@ -30,8 +30,8 @@ def trained(scene, steps, *settings):
     trainer, progress = build(config.trainer), Progress()
     trainer.prepare_machine()
     step = build_step(config, trainer, scene, progress)
-    step.tile_points, step.num_steps = TILE, steps
-    data = build(config.data)(scene=scene, progress=progress, seed=0, patch=step.loss.patch)
+    step.tiles.points, step.num_steps = TILE, steps
+    data = build(config.data)(scene=scene, progress=progress, seed=0, patch=step.objective.loss.patch)
     optimizer = step.new_optimizer()
     for _ in range(steps):
         step(data.batches.at(progress.attempt, progress.rays_seen), optimizer)

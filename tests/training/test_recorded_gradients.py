@@ -9,16 +9,19 @@ import torch
 from support.gpu_training import step_by_step
 from support.tape import tape
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.corrections.base import NoCorrection
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.training.gradients.recorded import cuda_graph
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.recorded_gradients import cuda_graph
-from nerf_lightning.training.step_output import StepOutput
 
 CPU = torch.device("cpu")
 KERNELS = CPU_BACKENDS
@@ -37,7 +40,8 @@ def as_on_a_gpu(monkeypatch):
 def trained(sizes, record, model="fast_small", *changes):
     """Take a step of each size, and return the run."""
     run = step_by_step(model, CPU, "32-true", None, *(changes or SMALL))
-    run.training.model.set_returns_weights(True)  # so that no kernel takes whole rays
+    for level in run.training.model.levels.values():
+        level.returns_weights = True  # so that no kernel takes whole rays
     if record:
         run.training.record_gradients(record=tape)
     for size in sizes:
@@ -56,20 +60,29 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     sizes = [48] * 6
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert list(run.training._recorded.recordings) == [(48, (None,))]
-    assert run.training.model.statistics()["train/dropped_samples"] == 0
+    assert [size for size, _ in run.training.recorded.recordings] == [48]
+    assert statistics(run.training.model)["train/dropped_samples"] == 0
     assert run.all_losses().unique().numel() == 6
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert sorted(size for size, _ in run.training._recorded.recordings) == [32, 48]
+    assert sorted(size for size, _ in run.training.recorded.recordings) == [32, 48]
+
+
+def test_each_of_several_processes_records_its_share(monkeypatch):
+    monkeypatch.setattr(ranks, "world_size", lambda: 2)
+    monkeypatch.setattr(ranks, "add_up", lambda tensors: None)  # the other one has nothing to add
+    monkeypatch.setattr(ranks, "from_first", lambda make: make())
+    run = trained([48] * 3, record=True)
+    assert_same(run, trained([48] * 3, record=False))
+    assert [size for size, _ in run.training.recorded.recordings] == [24]
 
 
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():
     run, other = trained([48] * 3, record=True), trained([48] * 3, record=False)
     for each in (run, other):
         each.training.restart(each.optimizer)
-        assert each is other or not each.training._recorded.recordings
+        assert each is other or not each.training.recorded.recordings
         for _ in range(3):
             each.step()
     assert_same(run, other)
@@ -83,10 +96,10 @@ def test_what_asks_the_host_cannot_be_recorded(monkeypatch):
 
 def test_what_the_host_decides_is_refused_by_name():
     run = step_by_step("fast_small", CPU)
-    run.training.loss = RobustLoss(run.training.loss)
+    run.training.objective.loss = RobustLoss(run.training.objective.loss)
     encoder = next(each for each in run.training.model.modules() if isinstance(each, HashGridEncoder))
     encoder.blend_in = 0.5
-    with pytest.raises(InputError, match=rf"{SETTING}.*another step: loss, encoder\.blend_in\. Leave it out"):
+    with pytest.raises(InputError, match=rf"{SETTING}.*another step: HashGridEncoder, RobustLoss. Leave it out"):
         run.training.record_gradients(record=tape)
 
 
@@ -104,12 +117,12 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
 def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
     run = trained([48] * 6, True, model, *changes)
     assert_same(run, trained([48] * 6, False, model, *changes))
-    assert len(run.training._recorded.recordings) == variants
+    assert len(run.training.recorded.recordings) == variants
 
 
 def test_models_that_read_on_the_host_and_other_devices_are_refused(monkeypatch):
     monkeypatch.setattr(RaggedLevel, "replays", False)
-    with pytest.raises(InputError, match=rf"{SETTING}.*another step: model\."):
+    with pytest.raises(InputError, match=rf"{SETTING}.*another step: RaggedLevel\."):
         step_by_step("fast_small", CPU).training.record_gradients(record=tape)
     with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
         TrainerSettings(accelerator="cpu", cuda_graph=True)
@@ -150,7 +163,7 @@ def test_what_cannot_be_recorded_is_computed_without(error, cause, caplog):
     for _ in range(3):
         run.step()
     assert [each.count(cause) for each in caplog.messages] == [1]
-    assert not run.training.records
+    assert not run.training.recorded
     assert_same(run, trained([48] * 3, record=False))
 
 
@@ -185,5 +198,19 @@ def test_steps_are_recorded_where_that_is_possible(setting, device, compile, mod
     settings = TrainerSettings(accelerator="cpu", cuda_graph=setting, compile=compile)
     settings.device_type = device
     assert settings.records(step) is recorded
-    step.loss = type("Own", (type(step.loss),), {"__module__": "my_parts"})()
+    step.objective.loss = type("Own", (type(step.objective.loss),), {"__module__": "my_parts"})()
     assert settings.records(step) is False
+
+
+@pytest.mark.parametrize(("says", "auto"), [(True, True), (None, False), (False, False)])
+def test_a_part_of_ones_own_says_itself_whether_it_can_be_replayed(says, auto):
+    step = step_by_step("fast_small", CPU).training
+    own = {"__module__": "my_parts"} | ({} if says is None else {"replays": says})
+    step.objective.correction = type("Mood", (NoCorrection,), own)()
+    settings = TrainerSettings(accelerator="cpu")
+    settings.device_type = "cuda"
+    assert settings.records(step) is auto
+    if says is not False:
+        return step.record_gradients(record=tape)
+    with pytest.raises(InputError, match=rf"{SETTING}.*another step: Mood\. Leave it out"):
+        step.record_gradients(record=tape)

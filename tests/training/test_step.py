@@ -15,7 +15,7 @@ from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.randomness import batch_random, fold
-from nerf_lightning.training.step import Share
+from nerf_lightning.training.gradients.tiles import Share
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -173,8 +173,8 @@ def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(mon
 
 def robust_step(tile_points, patch=4):
     step = make_step(tile_points)
-    step.loss = RobustLoss(MeanSquaredError(), patch=patch)
-    step.loss.threshold.fill_(0.05)  # leaves some out
+    step.objective.loss = RobustLoss(MeanSquaredError(), patch=patch)
+    step.objective.loss.threshold.fill_(0.05)  # leaves some out
     return step
 
 
@@ -185,7 +185,7 @@ def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
         loader = RayBatches(scene, step.progress, 0, 64, patch=4)
         seen = step(loader.at(0, 0), step.new_optimizer())
         flat = torch.cat([p.grad.flatten() for p in step.model.parameters()])
-        found.append((flat, seen.losses, step.loss.threshold))
+        found.append((flat, seen.losses, step.objective.loss.threshold))
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
     assert float(found[0][2]) != pytest.approx(0.05)
     plain = make_step(None)
@@ -199,11 +199,11 @@ def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_smaller_batch
     with torch.no_grad():
         step.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
     step(loader.at(0, 0), optimizer)
-    assert float(step.loss.threshold) == pytest.approx(0.05)
+    assert float(step.objective.loss.threshold) == pytest.approx(0.05)
     step.restart(optimizer)
-    assert float(step.loss.threshold) == 1.0
+    assert float(step.objective.loss.threshold) == 1.0
     step = make_step(None, sample_budget=8 * 40)
-    step.loss = RobustLoss(MeanSquaredError(), patch=4)
+    step.objective.loss = RobustLoss(MeanSquaredError(), patch=4)
     loader = RayBatches(ball_scene(), step.progress, 0, 64, patch=4)
     step(loader.at(0, 0), step.new_optimizer())
     assert step.progress.batch_rays == 16
@@ -238,7 +238,7 @@ def test_validation_has_no_jitter():
 
 def a_step_with_shifts(tile_points=None, model=None, **settings):
     scene, step = ball_scene(), make_step(tile_points, model)
-    step.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
+    step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
     return step
 
 

@@ -9,9 +9,11 @@ from support.static_models import fast_model
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.models.sample_counter import average_counts
+from nerf_lightning.nerf.part import fit_parts, sample_counts
 from nerf_lightning.training.tile_size import fastest
 
 MODELS = {"nerf": lambda: tiny_model(density_bias=0.5), "fast": lambda: fast_model(RaggedLevel)}
@@ -20,8 +22,8 @@ MODELS = {"nerf": lambda: tiny_model(density_bias=0.5), "fast": lambda: fast_mod
 @pytest.fixture(params=MODELS)
 def model(request):
     made = MODELS[request.param]()
-    made.fit_to(ball_scene())
-    made.update(0, 0)
+    fit_parts(made, ball_scene())
+    average_counts(made)
     return made
 
 
@@ -39,7 +41,7 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     optimizer = step.new_optimizer()
     optimizer.zero_grad()
     seen = step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), backward)
-    counts = torch.cat([count.float() for count in step.model.sample_counts()] or [torch.zeros(1)])
+    counts = torch.cat([count.float() for count in sample_counts(step.model)] or [torch.zeros(1)])
     return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen, counts
 
 

@@ -54,7 +54,6 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
             f"{_what_is_left(folder)} If it fails again, nerf selftest checks the GPU's results, and trainer=cpu does "
             "not use it."
         ) from error
-    job.system.step.forget_recordings()
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
         log.info("%d step%s in %s", steps, "s" * (steps != 1), spoken(job.clock.seconds))
@@ -93,23 +92,20 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         log.info("resuming from step %d of %s", former.step, folder.path)
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
-        step.tile_points = settings.tile_points
+        step.tiles.points = settings.tile_points
     settings.prepare(step.model)
     job.system.record["precision"] = settings.precision
-    records = settings.records(step)
     # A recording takes whole batches.
-    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not records
+    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(step)
     if former is None and measures_tile:
         tile, seconds = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
-        step.tile_points = settings.tile_points = tile
+        step.tiles.points = settings.tile_points = tile
         if seconds is not None:
             _announce_hours(job, seconds)
     if ranks.is_first():
         announce_memory(settings, step, job.data)
     if settings.compile:
         log.info("compiled levels: %s", ", ".join(step.model.compile_fields()) or "none has static shapes")
-    if records:
-        step.record_gradients()
 
 
 def _announce_hours(job: TrainJob, seconds: float) -> None:
@@ -133,7 +129,8 @@ def _announce_hours(job: TrainJob, seconds: float) -> None:
 
 def _announce(job: TrainJob, folder: HeldFolder) -> None:
     parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
-    step, tile = job.system.step, job.system.step.tile_points
+    tile = job.system.step.tiles.points
+    how = "whole batches" if tile is None else f"tiles of {tile} points"
     seconds = job.config.budget.seconds
     log.info(
         "run folder %s: %s of %d rays, %s parameters, %s, %s",
@@ -144,7 +141,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         job.data.batches.batch_rays,
         f"{parameters:,}",
         job.settings.describe(),
-        "steps replayed" if step.records else "whole batches" if tile is None else f"tiles of {tile} points",
+        "steps replayed" if job.settings.records(job.system.step) else how,
     )
     if folder.former is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")

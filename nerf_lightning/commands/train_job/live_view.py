@@ -89,7 +89,7 @@ class LiveView(Callback):
             pl_module.model,
             scene_record(scene),
             scene.background,
-            pl_module.step.tile_points or WHOLE_BATCH_POINTS,
+            pl_module.step.tiles.points or WHOLE_BATCH_POINTS,
             self.share,
             MOVING_SECONDS,
         )

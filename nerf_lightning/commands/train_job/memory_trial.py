@@ -22,6 +22,7 @@ from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.render_image import Picture
+from nerf_lightning.nerf.models.sample_counter import average_counts
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
@@ -67,11 +68,11 @@ def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, til
 def _untouched(step: TrainStep) -> Iterator[None]:
     """Put everything back that trial steps change; no trial changes weights."""
     buffers, former = list(step.model.buffers()), [buffer.clone() for buffer in step.model.buffers()]
-    tile = step.tile_points
+    tile = step.tiles.points
     try:
         yield
     finally:
-        step.tile_points = tile
+        step.tiles.points = tile
         step.reset_statistics()
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
@@ -87,7 +88,7 @@ def _step(
 
     def held(tile_rays: int, parts: int) -> int:
         points = model.points_per_ray(training=True)
-        step.tile_points = int((tile_rays + 0.5) * points)
+        step.tiles.points = int((tile_rays + 0.5) * points)
         some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
 
         def work() -> None:
@@ -98,7 +99,7 @@ def _step(
         return peak_bytes(work, settings.device)
 
     held(_few_rays(model, training=True), 1)  # compiles kernels
-    model.update(0, 0)  # how many samples rays have is known from here on
+    average_counts(model)  # how many samples rays have is known from here on
     few = _few_rays(model, training=True)
     two, four, larger = held(few, 2), held(few, 4), held(2 * few, 2)
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
@@ -125,7 +126,7 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
     def rendered(count: int) -> int:
         some = pixels[torch.arange(count, device=device) % pixels.view.numel()]
         with torch.no_grad():
-            behind = background_colors(step.background, count, device, None)
+            behind = background_colors(step.objective.background, count, device, None)
             return peak_bytes(lambda: model(step.rays(some), behind, None), device)
 
     per_ray = (rendered(2 * few) - rendered(few)) / few

@@ -16,6 +16,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.rendering.blending import background_colors
@@ -61,20 +62,20 @@ class Bench:
 
     def train_on(self, batch: Batch) -> None:
         """Compute gradients and update; where training replays steps, by a replay, with its guard against NaN."""
-        self._update(self.optimizer, lambda: self.step.gradients_of_step(batch))
+        self._update(self.optimizer, lambda: self.step.gradients(batch))
 
     def train_one_by_one(self, steps: int) -> None:
         """Take steps on the one batch, whole as in a replay, whose kernels are launched one by one."""
-        self.step.tile_points = None
+        self.step.tiles.points = None
         for _ in range(steps):
-            self._update(self.optimizer, lambda: self.step.gradients(self.batch))
-        self.step.tile_points = self.settings.tile_points
+            self._update(self.optimizer, lambda: self.step.tiles(self.batch, key=0))
+        self.step.tiles.points = self.settings.tile_points
 
     def train_plainly(self, steps: int) -> None:
         """Take steps on the one batch as one would first write them."""
         with self._plainly():
             for _ in range(steps):
-                self._update(self.plain_optimizer, lambda: self.step.gradients(self.batch))
+                self._update(self.plain_optimizer, lambda: self.step.tiles(self.batch, key=0))
 
     def _update(self, optimizer: torch.optim.Optimizer, gradients: Callable[[], object]) -> None:
         optimizer.zero_grad()
@@ -90,7 +91,7 @@ class Bench:
     def render(self, num_rays: int, plain: bool = False) -> None:
         """Render rays of the one batch."""
         places = torch.arange(num_rays, device=self.settings.device) % self.batch.num_rays
-        model, background = self.step.model, self.step.background
+        model, background = self.step.model, self.step.objective.background
         with torch.no_grad():
             rays = self.step.rays(self.batch.pixels[places])
             if not plain:  # as pictures are
@@ -104,15 +105,15 @@ class Bench:
         model = self.step.model
         samplers = [level.sampler for level in model.modules() if isinstance(level, RaggedLevel)]
         former = [sampler.opaque_below for sampler in samplers]
-        self.step.tile_points = None
-        model.set_precision("float32")
+        self.step.tiles.points = None
+        set_precision(model, "float32")
         for sampler in samplers:
             sampler.opaque_below = 0.0
         self._release_gradients()
         with without(*TWINS):
             yield
         self.settings.prepare(model)
-        self.step.tile_points = self.settings.tile_points
+        self.step.tiles.points = self.settings.tile_points
         for sampler, value in zip(samplers, former, strict=True):
             sampler.opaque_below = value
         self._release_gradients()
@@ -131,11 +132,10 @@ def prepare(config: DictConfig, scene: Scene) -> Bench:
     step = build_step(config, settings, scene, progress).to(settings.device)
     step.num_steps = max(1, config.warmup_steps)
     settings.prepare(step.model)
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.objective.loss.patch)
     data.settle(settings.device)
-    if settings.records(step):
-        step.record_gradients()
-    elif settings.measures_tile:
-        settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)[0]
+    step.begin_recording()
+    if step.recorded is None and settings.measures_tile:
+        settings.tile_points = step.tiles.points = measured_tile(settings, step, data.batches)[0]
     optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
     return Bench(settings, step, data, optimizer, plain)

@@ -22,7 +22,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     step that is replayed.
     """
     level = next((part for part in step.model.modules() if isinstance(part, RaggedLevel)), None)
-    if level is None or step.records:
+    if level is None or step.recorded:
         return {}
     rays, sampler = step.rays(batch.pixels), level.sampler
     optimizer.zero_grad()
@@ -85,5 +85,5 @@ def flops_per_ray(step: TrainStep, batch: Batch) -> float:
     # It sees torch's own operations, of its own thread.
     kernels = "mlp.cpu", "mlp.cuda", "render.gradients", "render.dense"
     with torch_threads(1), FlopCounterMode(display=False) as counter, without(*kernels):
-        step.gradients(rays)
+        step.tiles(rays, key=0)
     return counter.get_total_flops() / few

@@ -10,7 +10,7 @@ from torch.nn import functional
 from nerf_lightning.nerf.encoders.base import ConeEncoder, Encoder
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp
+from nerf_lightning.nerf.kernels.mlp.op import mlp
 from nerf_lightning.nerf.ranges import require_ranges
 
 CONE_OCTAVES = 4

@@ -17,7 +17,7 @@ from nerf_lightning.extensions.view_transformer.source_views import SourceViews,
 from nerf_lightning.extensions.view_transformer.view_tables import ViewTables
 from nerf_lightning.extensions.view_transformer.views import BlendedColor, Largest, PooledColor, Spread, Views
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.matmul_precision import Linear, MatmulPrecision
+from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -25,7 +25,7 @@ from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
-from nerf_lightning.nerf.types.scene import DRAWN, Scene
+from nerf_lightning.nerf.types.scene import DRAWN
 
 DEEP = 8.0
 """Rays that end so many times as far as they begin are sampled evenly in inverse distance."""
@@ -90,6 +90,7 @@ class ViewTransformer(Model):
     needs_photographs = True
     baselines = staticmethod(baselines)
     has_static_shapes = False
+    replays = False
 
     def __init__(
         self,
@@ -211,15 +212,6 @@ class ViewTransformer(Model):
     def points_per_ray(self, training: bool) -> float:
         """Return samples times sources: each point is looked at in every view."""
         return float(self.sampler.num_samples_after(0) * self.num_sources)
-
-    def fit_to(self, scene: Scene) -> None:
-        """Nothing of a scene is kept: any may follow."""
-
-    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
-        """Set the precision of the products with the transformer's weights; the image network is float32 always."""
-        for module in self.modules():
-            if isinstance(module, Linear):
-                module.matmul_precision = matmul_precision
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -22,9 +22,6 @@ class Correction(Part, ABC):
     the model's own, neutral colors. As it begins, it changes no bit.
     """
 
-    replays: bool = False
-    """True where it does the same in each step, so that a recording of it (trainer.cuda_graph) can be replayed."""
-
     def fit_to(self, scene: SceneRecord) -> None:
         """Take note of the photographs, once, before training.
 
@@ -68,8 +65,6 @@ class Correction(Part, ABC):
 
 class NoCorrection(Correction):
     """Leave every color as it is: photographs show what there is."""
-
-    replays = True
 
     def fit_to(self, scene: SceneRecord) -> None:
         """Take any scene."""

@@ -24,7 +24,6 @@ class Exposure(Correction):
         mean_weight: weight of the sum of the squared means in the loss.
     """
 
-    replays = True
     trained: Tensor
 
     def __init__(self, learning_rate: float = 1e-2, mean_weight: float = 1.0):

@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.ranges import require_ranges
 
@@ -96,6 +96,11 @@ class HashGridEncoder(Encoder):
         """Return the features of points, with gradients, where they have been computed without them before."""
         # While levels are blended in they are computed again: what is known has been weighted.
         return self._interpolate(points, None if self._blends else features.reshape(-1, self.out_dim))
+
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
+        """Whether no levels are blended in."""
+        return not self.blend_in
 
     def on_step(self, context: StepContext) -> None:
         """Blend the levels in that are due: level l (from 0) rises over the l-th part of `blend_in`."""

@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.spherical_harmonics import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 
 # Normalized so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
 DEGREE_1 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -34,23 +35,25 @@ class SphericalHarmonicsEncoder(Encoder):
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
         """Return Y_00, Y_1-1, Y_10, Y_11, Y_2-2, ..."""
-        if points.dtype == torch.float32 and not points.requires_grad:
-            kernels = cuda_backend("spherical_harmonics.cuda", points.device)
-            if kernels is not None:
-                return kernels.spherical_harmonics(points.reshape(-1, 3), self.degree).view(*points.shape[:-1], -1)
-        x, y, z = points.movedim(-1, 0).contiguous()
-        columns = [torch.full_like(x, DEGREE_1)]
-        if self.degree > 1:
-            columns += [-DEGREE_2 * y, DEGREE_2 * z, -DEGREE_2 * x]
-        if self.degree > 2:
-            a, b, c = DEGREE_3
-            columns += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
-        if self.degree > 3:
-            columns += _degree_4(x, y, z)
-        return torch.stack(columns).movedim(0, -1).contiguous()  # written in one go, then turned: twice as fast
+        return spherical_harmonics(points, self.degree)
 
     def reset_parameters(self) -> None:
         """Nothing is learned here."""
+
+
+@with_kernel(op.spherical_harmonics)
+def spherical_harmonics(points: Float[Tensor, "*points 3"], degree: int) -> Float[Tensor, "*points features"]:
+    """Return Y_00, Y_1-1, Y_10, Y_11, Y_2-2, ... of unit directions."""
+    x, y, z = points.movedim(-1, 0).contiguous()
+    columns = [torch.full_like(x, DEGREE_1)]
+    if degree > 1:
+        columns += [-DEGREE_2 * y, DEGREE_2 * z, -DEGREE_2 * x]
+    if degree > 2:
+        a, b, c = DEGREE_3
+        columns += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
+    if degree > 3:
+        columns += _degree_4(x, y, z)
+    return torch.stack(columns).movedim(0, -1).contiguous()  # written in one go, then turned: twice as fast
 
 
 def _degree_4(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:

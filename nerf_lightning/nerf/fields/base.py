@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.matmul_precision import Linear, MatmulPrecision
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
-from nerf_lightning.nerf.types.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -38,15 +36,6 @@ class Field(Part, ABC):
     """The precision of the products with the field's weights, and of nothing else: layers are
     `matmul_precision.Linear`, and kernels are given this. A field that does neither multiplies in float32 everywhere,
     which is slow and right."""
-
-    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
-        """Set the precision of the products with the field's weights; positions, densities and colors stay float32."""
-        for module in self.modules():
-            if isinstance(module, Linear | Field | Encoder):
-                module.matmul_precision = matmul_precision
-
-    def fit_to(self, scene: Scene) -> None:
-        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
     @abstractmethod
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:

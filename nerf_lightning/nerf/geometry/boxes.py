@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
-from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.march import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.rays import RayBundle
 
 
@@ -39,14 +40,11 @@ def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Flo
     return aabb.mean(dim=0), 0.5 * (aabb[1] - aabb[0])
 
 
+@with_kernel(op.distances_in_box)
 def distances_in_box(
     rays: RayBundle, aabb: Float[Tensor, "2 3"]
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
     """Return where each ray enters and leaves a box, within its near and far; the first is not smaller on a miss."""
-    plain = rays.near.dim() == 1 and not (rays.origins.requires_grad or rays.directions.requires_grad)
-    kernels = cuda_backend("march.cuda", rays.near.device) if plain else None
-    if kernels is not None:
-        return kernels.distances_in_box(rays, aabb)
     # A direction of exactly zero gives infinities, which order rightly; on a face they would give nan.
     inverse = 1.0 / torch.where(rays.directions == 0, 1e-20, rays.directions)
     a, b = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse

@@ -14,7 +14,8 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cones import pixel_side
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.rays import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
@@ -69,6 +70,7 @@ def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, 
 
 
 @disable_autocast
+@with_kernel(op.rays_through_pixels)
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
@@ -92,9 +94,6 @@ def rays_through_pixels(
         per_side: so many rays share each side of a pixel.
     """
     view = pixels.view
-    kernels = cuda_backend("rays.cuda", cameras.c2w.device) if subpixel_offset is None else None
-    if kernels is not None and kernels.takes(cameras):
-        return kernels.rays_through_pixels(cameras, pixels, near, far, per_side)
     at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
     if subpixel_offset is not None:
         at = at + subpixel_offset

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.panoramas import panorama_stretches, project_panorama, unproject_panorama
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.lenses import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.scene import LensModel
 
 NEWTON_STEPS = 8
@@ -64,7 +65,7 @@ def unproject(
         radius = _length(plane)
         return at_angle(_angle_at(radius, lens), plane / radius[..., None])
     if model == "radial_tangential":
-        plane = _undistorted(plane, lens)
+        plane = _undistorted(plane, lens, NEWTON_STEPS)
     return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
 
 
@@ -129,15 +130,12 @@ def _distorted(plane: Tensor, lens: Tensor) -> tuple[Tensor, tuple[Tensor, Tenso
     return torch.stack([bent_x, bent_y], dim=-1), (along_x, across, along_y)
 
 
-def _undistorted(plane: Tensor, lens: Tensor) -> Tensor:
+@with_kernel(op.undistort)
+def _undistorted(plane: Tensor, lens: Tensor, newton_steps: int) -> Tensor:
     # Newton's iteration in two dimensions. From the distorted point on it cannot overshoot a lens that bends one way
     # only (barrel: from below a concave function; pincushion: from above a convex one).
-    kernels = cpu_backend("lenses.cpu", plane.device)
-    if kernels is not None and not (plane.requires_grad or lens.requires_grad):
-        rows = plane.reshape(-1, 2), lens.expand(*plane.shape[:-1], 6).reshape(-1, 6)
-        return kernels.undistort(*rows, NEWTON_STEPS).view(plane.shape)
     found = plane
-    for _ in range(NEWTON_STEPS):
+    for _ in range(newton_steps):
         bent, (along_x, across, along_y) = _distorted(found, lens)
         off_x, off_y = (bent - plane).unbind(dim=-1)
         step_x, step_y = along_y * off_x - across * off_y, along_x * off_y - across * off_x

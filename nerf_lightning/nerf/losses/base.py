@@ -45,10 +45,3 @@ class Loss(Part, ABC):
             target: what the photographs show.
             weight: 0 for masked pixels.
         """
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return the buffers that `learn` has changed, whose means the processes of a run must agree on."""
-        return []
-
-    def forget(self) -> None:
-        """Forget what was learned, for a new attempt."""

@@ -46,6 +46,8 @@ class RobustLoss(Loss):
         ValueError: a number out of its range.
     """
 
+    replays = False
+
     def __init__(self, of: Loss, share: int | float = 0.8, times: int | float = 4.0, patch: int = 4):
         super().__init__()
         require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
@@ -77,8 +79,9 @@ class RobustLoss(Loss):
         """Return the threshold, on which the processes of a run must agree."""
         return [self.threshold]
 
-    def forget(self) -> None:
+    def reset_parameters(self) -> None:
         """Leave nothing out again."""
+        super().reset_parameters()
         self.threshold.fill_(FIRST_THRESHOLD)
 
 

@@ -45,17 +45,6 @@ class WeightedSum(Loss):
         self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
     ) -> None:
         """Let each loss learn."""
-        for loss in self._losses():
-            loss.learn(rgb, target, weight)
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return those of all losses."""
-        return [each for loss in self._losses() for each in loss.buffers_to_average()]
-
-    def forget(self) -> None:
-        """Let each loss forget."""
-        for loss in self._losses():
-            loss.forget()
-
-    def _losses(self) -> list[Loss]:
-        return [loss for loss in self.terms.values() if isinstance(loss, Loss)]
+        for loss in self.terms.values():
+            if isinstance(loss, Loss):
+                loss.learn(rgb, target, weight)

@@ -1,7 +1,7 @@
 """The contract of a model: what training, bench, exporters and the viewer ask of it, and no more."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,8 +11,8 @@ from torch.nn.utils import get_total_norm
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.photographs import photographs_of
-from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.subpixels import Subpixels
+from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.points import Points
@@ -23,7 +23,7 @@ from nerf_lightning.nerf.types.scene import Background, Scene
 Baselines = Callable[[Scene, list[int], Background, int], dict[str, Any]]
 
 
-class Model(nn.Module, ABC):
+class Model(Part, ABC):
     """Render rays, in one round or in several that build on each other; the last one's picture counts."""
 
     has_static_shapes: bool = True
@@ -32,12 +32,6 @@ class Model(nn.Module, ABC):
     """True where it renders a scene from photographs: `set_source_images` is called before the first rays."""
     baselines: Baselines | None = None
     """Mean PSNR (dB) of views that are shown by so many photographs, without the model, for each way to do so."""
-
-    replays: bool = False
-    """True where a training step's kernels are the same in each step of one `step_variant`, so that a recording of them
-    may be replayed. Then `sample_counts` are all that a step changes."""
-    step_variant: Hashable = None
-    """What the host has decided for the next step, which changes what kernels it takes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,44 +77,11 @@ class Model(nn.Module, ABC):
     def points_per_ray(self, training: bool) -> float:
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
 
-    @abstractmethod
-    def fit_to(self, scene: Scene) -> None:
-        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
-
     def set_source_images(self, photographs: Photographs) -> None:
         """Take the photographs that rays are rendered from, in the place of earlier ones; most models need none.
 
         They are no part of the model's state: no checkpoint carries them.
         """
-
-    @abstractmethod
-    def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator, and forget what was learned otherwise."""
-
-    @abstractmethod
-    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
-        """Set the precision of the products with the fields' weights; everything else is float32 always."""
-
-    def set_returns_weights(self, wanted: bool) -> None:
-        """Set whether renderings in training have weights and samples where they could do without (`Loss`)."""
-
-    def update(self, step: int, key: int) -> None:
-        """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
-
-    def sample_counts(self) -> list[Tensor]:
-        """Return the buffers in which a training step counts, to put them back where a step is repeated."""
-        return []
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return the buffers that hold means over rays, which the processes of a run must agree on."""
-        return []
-
-    def reset_statistics(self) -> None:
-        """Forget what was counted while rendering."""
-
-    def statistics(self) -> dict[str, float]:
-        """Return what is worth watching while training."""
-        return {}
 
     def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
         """Return the Euclidean norms of gradients, by round."""
@@ -167,15 +128,13 @@ def norm_of_gradients(module: nn.Module) -> Float[Tensor, ""]:
 
 
 def _look_at_what_was_loaded(model: Model, _: Any) -> None:
-    """Let the parts of a model look at what was loaded into them, where they know what it can be.
+    """Let the parts of a model look at what was loaded into them.
 
     Raises:
         InputError: a part holds what it never can.
     """
-    for part in model.modules():
-        look = getattr(part, "validate_state", None)
-        if look is not None:
-            look()
+    for part in parts_of(model):
+        part.validate_state()
 
 
 def show_photographs(model: Model, scene: Scene) -> None:

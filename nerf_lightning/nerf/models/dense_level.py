@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.kernels.render.op import DENSE, has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import DENSE, has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -36,7 +36,6 @@ class DenseLevel(Level):
 
     sampler: DenseSampler
     sampler_kind = DenseSampler
-    replays = True
     kernels = (DENSE, "mlp.cpu", "hash_grid.cpu", "histograms.cpu", "random.cpu", "adam.cpu")
 
     def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
@@ -49,8 +48,7 @@ class DenseLevel(Level):
         return float(self.sampler.num_samples_after(int(before)))
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of where the scene's content lies, and whether its distances are any."""
-        super().fit_to(scene)
+        """Take note of whether the scene's distances are any."""
         if scene.cameras.ndc is not None:
             self.gradient_scaling_distance = 0.0
 

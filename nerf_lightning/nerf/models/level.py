@@ -1,23 +1,22 @@
 """The contract of a level: one round of sampling and rendering."""
 
 from abc import abstractmethod
-from collections.abc import Hashable
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.part import Part, StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import Sampler
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
-from nerf_lightning.nerf.types.scene import Scene
 
 
-class Level(nn.Module):
+class Level(Part):
     """The contract of a level: one round of sampling and rendering.
 
     Args:
@@ -38,12 +37,6 @@ class Level(nn.Module):
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
-
-    replays: bool = False
-    """True where a training step's kernels are the same in each step on a GPU (`Model.replays`)."""
-
-    step_variant: Hashable = None
-    """What the host has decided for the next step (`Model.step_variant`)."""
 
     kernels: tuple[str, ...] = ()
     """Modules of `nerf.kernels` that it takes on a CPU, where kernels know its field."""
@@ -76,11 +69,6 @@ class Level(nn.Module):
         """Return whether a kernel takes rays from end to end (`Model.takes_whole_rays`)."""
         return False
 
-    def fit_to(self, scene: Scene) -> None:
-        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
-        self.field.fit_to(scene)
-        self.sampler.fit_to(scene)
-
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density per unit length, as rendering finds it."""
         return self.sampler.reached_density(self.field_density, positions).float()
@@ -89,31 +77,10 @@ class Level(nn.Module):
         """Return the density per unit length, as the field has it."""
         return self.field.density(Points(positions))[0]
 
-    def sample_counts(self) -> list[Tensor]:
-        """Return the buffers in which a training step counts, to put them back where a step is repeated."""
-        return []
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return the buffers that hold means over rays, which the processes of a run must agree on."""
-        return []
-
     def compile_field(self) -> bool:
         """Compile the field where its shapes do not depend on the data; tell whether it was."""
         return False
 
-    def update(self, step: int, key: int) -> None:
-        """Let the sampler learn between steps of training: `step` steps have been taken, `key` is the next one's."""
-        self.sampler.update(self.field_density, step, key)
-
-    def statistics(self) -> dict[str, float]:
-        """Return what is worth watching while training."""
-        return self.sampler.statistics()
-
-    def reset_statistics(self) -> None:
-        """Forget what was counted while rendering."""
-
-    def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator, and forget what was learned otherwise."""
-        self.field.reset_parameters()
-        self.sampler.reset()
-        self.reset_statistics()
+    def on_step(self, context: StepContext) -> None:
+        """Let the sampler learn from the field."""
+        self.sampler.learn(self.field_density, context.step, context.key)

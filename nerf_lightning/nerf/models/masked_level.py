@@ -25,6 +25,7 @@ class MaskedLevel(Level):
 
     sampler: OccupancySampler
     sampler_kind = OccupancySampler
+    replays = False
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """All intervals of the lattice."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import Sampler
@@ -52,10 +53,10 @@ class ProposalLevel(DenseLevel):
         """Whether it learns."""
         return self._learns
 
-    def update(self, step: int, key: int) -> None:
+    def on_step(self, context: StepContext) -> None:
         """Decide whether the next step is one to learn in."""
-        super().update(step, key)
-        self._learns = step < self.learn_always or step % self.learn_every == 0
+        super().on_step(context)
+        self._learns = context.step < self.learn_always or context.step % self.learn_every == 0
 
     def forward(
         self,

@@ -1,13 +1,12 @@
 """A method as named levels of (sampler, field): each level samples where the one before saw something."""
 
-from typing import Any, cast
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.geometry.contraction import Contracted
-from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.base import PointField, norm_of_gradients
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.subpixels import Subpixels
@@ -15,7 +14,6 @@ from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
-from nerf_lightning.nerf.types.scene import Scene
 
 
 class RadianceModel(PointField):
@@ -51,16 +49,6 @@ class RadianceModel(PointField):
     def has_static_shapes(self) -> bool:  # type: ignore[override]
         """Whether no level's shapes depend on what it finds."""
         return all(level.has_static_shapes for level in self._in_order())
-
-    @property
-    def replays(self) -> bool:  # type: ignore[override]
-        """Whether every level does."""
-        return all(level.replays for level in self._in_order())
-
-    @property
-    def step_variant(self) -> tuple[Any, ...]:  # type: ignore[override]
-        """Those of all levels."""
-        return tuple(level.step_variant for level in self._in_order())
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether every level does."""
@@ -104,24 +92,6 @@ class RadianceModel(PointField):
             history.append(level(rays, background, history, random))
         return history
 
-    def fit_to(self, scene: Scene) -> None:
-        """Tell the levels where the scene's content lies, once, before training."""
-        for level in self._in_order():
-            level.fit_to(scene)
-
-    def sample_counts(self) -> list[Tensor]:
-        """Return the buffers of all levels in which a training step counts."""
-        return [count for level in self._in_order() for count in level.sample_counts()]
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return the buffers of all levels that hold means over rays."""
-        return [measured for level in self._in_order() for measured in level.buffers_to_average()]
-
-    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
-        """Set the precision of the products with the fields' weights; everything else is float32 always."""
-        for level in self._in_order():
-            level.field.set_precision(matmul_precision)
-
     def kernels(self) -> tuple[str, ...]:
         """Return the kernels of the levels whose fields kernels know."""
         return tuple(name for level in self._in_order() if level.field.parts() is not None for name in level.kernels)
@@ -133,34 +103,9 @@ class RadianceModel(PointField):
                 module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
-    def set_returns_weights(self, wanted: bool) -> None:
-        """Set whether renderings in training have weights and samples where they could do without."""
-        for level in self._in_order():
-            level.returns_weights = wanted
-
-    def update(self, step: int, key: int) -> None:
-        """Do what the levels do between steps of training."""
-        for level in self._in_order():
-            level.update(step, key)
-
-    def statistics(self) -> dict[str, float]:
-        """Return what is worth watching while training, of all levels."""
-        return {name: value for level in self._in_order() for name, value in level.statistics().items()}
-
     def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
         """Return the Euclidean norm of the gradients of each level."""
         return {name: norm_of_gradients(level) for name, level in zip(self.levels, self._in_order(), strict=True)}
-
-    def reset_statistics(self) -> None:
-        """Forget what was counted while rendering."""
-        for level in self._in_order():
-            level.reset_statistics()
-
-    def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
-        self.subpixels.reset()
-        for level in self._in_order():
-            level.reset_parameters()
 
     def _in_order(self) -> list[Level]:
         return cast(list[Level], list(self.levels.values()))

@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.render.whole_rays import (
+from nerf_lightning.nerf.kernels.render.op import (
     LEARNING,
     RENDERING,
     has_kernel,
@@ -14,8 +13,10 @@ from nerf_lightning.nerf.kernels.render.whole_rays import (
     render_whole_rays,
     takes_samples,
 )
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
@@ -37,7 +38,6 @@ class RaggedLevel(Level):
     sampler: RaggedSampler
     sampler_kind = RaggedSampler
     has_static_shapes = False
-    replays = True  # with arrays of a capacity, which no size is read for
     kernels = (LEARNING, RENDERING, "mlp.cpu", "hash_grid.cpu", "carving.cpu", "march.cpu", "random.cpu", "adam.cpu")
 
     def __init__(self, sampler: Sampler, field: Field):
@@ -127,30 +127,9 @@ class RaggedLevel(Level):
         counted = self.counter.per_ray
         return max(1.0, float(self.sampler.samples_at_first) if counted is None else counted)
 
-    def update(self, step: int, key: int) -> None:
+    def on_step(self, context: StepContext) -> None:
         """Let the sampler learn, where it is time, and average the samples per ray of the steps since."""
-        if step % self.sampler.update_every and step != 1:
+        if context.step % self.sampler.update_every and context.step != 1:
             return
-        super().update(step, key)
+        super().on_step(context)
         self.counter.average()
-
-    def sample_counts(self) -> list[Tensor]:
-        """Return samples and rays since the sampler's last update."""
-        return [self.counter.counts]
-
-    def buffers_to_average(self) -> list[Tensor]:
-        """Return the samples per ray; `points_per_ray` reads them again after this."""
-        self.counter.reread()
-        return [self.counter.mean]
-
-    def reset_statistics(self) -> None:
-        """Forget how many samples rays have."""
-        self.counter.reset()
-
-    def statistics(self) -> dict[str, float]:
-        """Samples per ray, samples for which there was no room, and what the sampler has to say."""
-        counted = {
-            "speed/samples_per_ray": float(self.counter.mean),
-            "train/dropped_samples": float(self.counter.counts[2]),
-        }
-        return counted | self.sampler.statistics()

@@ -110,10 +110,6 @@ class RayGenerator(Part):
         each = pixels.map(lambda of_pixel: for_each_ray(of_pixel, subpixels.per_pixel))
         return self(each, subpixel_offset, subpixels.per_side)
 
-    def reset_parameters(self) -> None:
-        """Put the cameras back to where they were given."""
-        self.refinement.reset_parameters()
-
     def refined(self, trained: Sequence[int]) -> Cameras | None:
         """Return the cameras as learned, the others aligned with them, on the CPU; None where none learns.
 

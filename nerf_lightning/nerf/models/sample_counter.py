@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
+from nerf_lightning.nerf.part import Part
 
 # So many samples per ray at most can have been counted.
 MOST_SAMPLES = 1 << 12
@@ -15,7 +16,7 @@ MOST_SAMPLES = 1 << 12
 COUNTING = Lock()
 
 
-class SampleCounter(nn.Module):
+class SampleCounter(Part):
     """Count samples on the device; `per_ray` is read on the host once after each average."""
 
     counts: Int[Tensor, "3"]
@@ -49,15 +50,28 @@ class SampleCounter(nn.Module):
             self._per_ray = float(self.mean)
         return self._per_ray if self._per_ray >= 0 else None
 
-    def reread(self) -> None:
-        """Read `mean` again when it is next asked for."""
-        self._per_ray = None
+    def sample_counts(self) -> list[Tensor]:
+        """Return samples and rays since the last average."""
+        return [self.counts]
 
-    def reset(self) -> None:
+    def buffers_to_average(self) -> list[Tensor]:
+        """Return the samples per ray; `per_ray` reads them again after this."""
+        self._per_ray = None
+        return [self.mean]
+
+    def statistics(self) -> dict[str, float]:
+        """Return samples per ray, and samples for which there was no room."""
+        return {"speed/samples_per_ray": float(self.mean), "train/dropped_samples": float(self.counts[2])}
+
+    def reset_statistics(self) -> None:
         """Forget all counts."""
         self.counts.zero_()
         self.mean.fill_(-1.0)
         self._per_ray = None
+
+    def reset_parameters(self) -> None:
+        """Forget all counts."""
+        self.reset_statistics()
 
     def validate_state(self) -> None:
         """Check what was loaded.
@@ -71,3 +85,10 @@ class SampleCounter(nn.Module):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self._per_ray = None
+
+
+def average_counts(module: nn.Module) -> None:
+    """Let every counter within a module take the mean over the rays since its last average."""
+    for part in module.modules():
+        if isinstance(part, SampleCounter):
+            part.average()

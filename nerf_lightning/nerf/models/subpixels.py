@@ -30,6 +30,11 @@ class Subpixels(Part):
 
     now: Tensor
 
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
+        """Whether the number of rays stays as it is."""
+        return self.side == 1
+
     def __init__(self, side: int = 1, start: float = 0.0):
         super().__init__()
         require_ranges({"subpixels": side, "subpixels_from": start}, {"subpixels": (1, MOST), "subpixels_from": (0, 1)})
@@ -64,8 +69,8 @@ class Subpixels(Part):
         """Take several rays a pixel from `start` on."""
         self._set(self.side if context.progress >= self.start else 1)
 
-    def reset(self) -> None:
-        """Begin with one ray through each pixel's center, for a new attempt."""
+    def reset_parameters(self) -> None:
+        """Begin with one ray through each pixel's center."""
         self._set(1)
 
     def validate_state(self) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import torch
 
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -42,6 +43,11 @@ def tile_rays_for(model: Model, tile_points: int, training: bool = False) -> int
     return max(1, int(tile_points / model.points_per_ray(training)))
 
 
+def pixels_in_tile(model: Model, tile_points: int, training: bool = False) -> int:
+    """Return how many pixels' rays make such a tile, at least one."""
+    return max(1, tile_rays_for(model, tile_points, training) // model.subpixels.per_pixel)
+
+
 def is_out_of_memory(error: RuntimeError) -> bool:
     """Tell whether there was no room for a tensor; smaller tiles may find it."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
@@ -70,8 +76,8 @@ def weighted_renderings(
     count = rays.near.numel()
     random = batch_random(key, count, rays.near.device)
     behind = background_colors(background, count, rays.near.device, random)
-    counts = [number.clone() for number in model.sample_counts()]
+    counts = [number.clone() for number in sample_counts(model)]
     for part in tiles(count, tile_rays_for(model, tile_points, training=True)):
         yield rays[part], model(rays[part], None if behind is None else behind[part], random[part])
-    for number, before in zip(model.sample_counts(), counts, strict=True):
+    for number, before in zip(sample_counts(model), counts, strict=True):
         number.copy_(before)

@@ -45,6 +45,7 @@ class SE3Delta(Refinement):
         weight: weight of the penalty: the sum of squares of all of these, divided by the number of photographs.
     """
 
+    replays = False
     extent: Tensor
     distance: Tensor
     camera: Tensor

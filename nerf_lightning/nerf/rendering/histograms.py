@@ -8,10 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.backends import backend_for
+from nerf_lightning.nerf.kernels.histograms import op
 from nerf_lightning.nerf.kernels.search import search
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 
 
+@with_kernel(op.sample)
 def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
@@ -34,9 +36,6 @@ def sample_histogram(
     """
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(f"{weights.shape[-1]} weights need {weights.shape[-1] + 1} edges, not {edges.shape[-1]}")
-    kernels = backend_for("histograms", u.device) if u.dim() == 2 and edges.dtype == torch.float32 else None
-    if kernels is not None and not (edges.requires_grad or weights.requires_grad):
-        return kernels.sample(edges, weights, u, floor, contracted)
     if contracted:
         return from_normalized_distance(sample_histogram(normalized_distance(edges), weights, u, floor))
     mass = weights + floor

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.ragged.integrate import integrate
+from nerf_lightning.nerf.kernels.ragged.op import integrate
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, RaggedRendering
 

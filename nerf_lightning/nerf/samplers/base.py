@@ -12,7 +12,6 @@ from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
-from nerf_lightning.nerf.types.scene import Scene
 
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 """A field's density (per unit length) at positions."""
@@ -24,13 +23,7 @@ class Sampler(Part):
     max_intervals: int = 1 << 17
     """So many steps at most are taken along a ray: near and far may come out of a file."""
 
-    def fit_to(self, scene: Scene) -> None:
-        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
-
-    def reset(self) -> None:
-        """Forget what was learned of the scene while training."""
-
-    def update(self, density: DensityFn, step: int, key: int) -> None:
+    def learn(self, density: DensityFn, step: int, key: int) -> None:
         """Learn from the field between steps of training.
 
         Args:
@@ -42,10 +35,6 @@ class Sampler(Part):
     def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density where rays look for it; 0 where they pass over, whatever the field says."""
         return density(positions)
-
-    def statistics(self) -> dict[str, float]:
-        """Return what is worth watching while training."""
-        return {}
 
 
 class DenseSampler(Sampler, ABC):

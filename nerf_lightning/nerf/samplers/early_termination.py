@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
+from nerf_lightning.nerf.kernels.ragged.op import num_visible
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.ragged import composite_ragged, first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import ragged_points

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
-from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -112,7 +112,7 @@ class OccupancySampler(RaggedSampler):
                 "show: no camera sees it, or all that they see there is transparent. Correct the box "
                 "(scene.aabb_half), or the cameras' poses."
             )
-        self.reset()
+        self.grid.reset_parameters()
         if scene.space == "bounded":
             self._question_cameras_inside(scene)
 
@@ -146,10 +146,6 @@ class OccupancySampler(RaggedSampler):
     def marcher(self, rays: RayBundle) -> RayMarcher:
         """Begin to render rays: each march goes on where it stopped."""
         return GridMarcher(self, rays)
-
-    def reset(self) -> None:
-        """Take every cell that may hold something for occupied."""
-        self.grid.reset()
 
     def statistics(self) -> dict[str, float]:
         """Return the share of cells that are occupied."""
@@ -223,7 +219,7 @@ class OccupancySampler(RaggedSampler):
             )
 
     @torch.no_grad()
-    def update(self, density: DensityFn, step: int, key: int) -> None:
+    def learn(self, density: DensityFn, step: int, key: int) -> None:
         """Ask the field about the cells, where it is time; without reading anything on the host.
 
         Args:

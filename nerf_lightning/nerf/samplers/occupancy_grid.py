@@ -4,18 +4,19 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.samplers.base import DensityFn
 
 CELLS_AT_ONCE = 1 << 18
 
 
-class OccupancyGrid(nn.Module):
+class OccupancyGrid(Part):
     """Cells in a box, numbered z fastest."""
 
     aabb: Tensor
@@ -62,7 +63,7 @@ class OccupancyGrid(nn.Module):
         """Return what a march looks at: which cells are occupied now."""
         return OccupancyCells(self.aabb, self.cells, self.leaps)
 
-    def reset(self) -> None:
+    def reset_parameters(self) -> None:
         """Forget what was learned: every possible cell is occupied."""
         self.density.zero_()
         self.occupy(self.possible)

@@ -1,7 +1,6 @@
 """What the photographs' frames and alpha say of space before anything is learned: seen at all, and not seen through."""
 
 import math
-from types import ModuleType
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,8 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.kernels.backends import cpu_backend
-from nerf_lightning.nerf.kernels.carving import reference as carving_reference
+from nerf_lightning.nerf.kernels.carving.op import steps_for
 from nerf_lightning.nerf.types.scene import Scene
 
 WRONG_BY = math.radians(1.0)
@@ -37,7 +35,7 @@ def possible_cells(
         half_diagonal: from a cell's center to its corner.
         most_views: carving looks at so many views, evenly spread.
     """
-    views, steps = scene.splits["train"], _steps(scene, centers)
+    views, steps = scene.splits["train"], steps_for(scene.cameras, centers)
     centers = centers.t().contiguous().t()  # an axis after the other in memory, as kernels like to read them
     cells = torch.zeros(centers.shape[0], dtype=torch.bool)
     for view in views:
@@ -53,12 +51,6 @@ def possible_cells(
                 seen_through += cells & ~left
                 cells &= seen_through < AGREEING
     return cells
-
-
-def _steps(scene: Scene, centers: Tensor) -> ModuleType:
-    plain = scene.cameras.lens_model == "pinhole" and centers.dtype == scene.cameras.c2w.dtype == torch.float32
-    twin = cpu_backend("carving.cpu", centers.device) if plain else None
-    return carving_reference if twin is None else twin
 
 
 def _matter(scene: Scene, view: int) -> Bool[Tensor, "height width"]:

@@ -1,13 +1,12 @@
 """Stratified samples between near and far (Eq. 2, arXiv 2003.08934)."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.backends import backend_for
+from nerf_lightning.nerf.kernels.histograms import op
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
@@ -52,6 +51,7 @@ class StratifiedSampler(DenseSampler):
         return self.num_samples
 
 
+@with_kernel(op.stratified)
 def stratified_edges(
     shares: Float[Tensor, "edges"],
     jitter: Float[Tensor, "*rays inner"] | None,
@@ -68,9 +68,6 @@ def stratified_edges(
         high: where each ray ends.
         contracted: whether `low` and `high` are normalized distances.
     """
-    kernels: Any = backend_for("histograms", low.device) if low.dim() == 1 and low.dtype == torch.float32 else None
-    if kernels is not None and not (low.requires_grad or high.requires_grad):
-        return kernels.stratified(shares, jitter, low, high, contracted)
     s = shares.expand(*low.shape, -1)
     if jitter is not None:
         s = torch.cat([s[..., :1], s[..., 1:-1] + jitter, s[..., -1:]], dim=-1)

@@ -9,8 +9,8 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import require_positive
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
-from nerf_lightning.training.step_output import StepOutput
 
 log = logging.getLogger(__name__)
 

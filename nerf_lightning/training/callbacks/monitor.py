@@ -8,9 +8,10 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.watcher import Watcher
-from nerf_lightning.training.step_output import StepOutput
 
 GIGABYTE = 1e9
 
@@ -63,7 +64,7 @@ class Monitor(Watcher):
         values = level_scalars(names, output.losses, output.color_errors, pictures)
         if len(output.terms) > 1:
             values |= {f"train/loss_{name}": float(term.sum()) for name, term in output.terms.items()}
-        values |= system.model.statistics()
+        values |= statistics(system.model)
         values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds

@@ -12,8 +12,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.launch.trainer import MOST_STEPS
-from nerf_lightning.training.step_output import StepOutput
 
 EARLY = 0.05
 """The share of a run whose speed says little of the rest."""

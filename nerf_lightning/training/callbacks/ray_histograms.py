@@ -59,10 +59,10 @@ def look_along(
     model, rays = training.model, training.rays(pixels)
     names, num_rays = model.level_names, rays.near.numel()
     key = fold(training.seed, step, "histograms")
-    tile_points = training.tile_points or WHOLE_BATCH_POINTS
+    tile_points = training.tiles.points or WHOLE_BATCH_POINTS
     seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in names}
     model.eval()
-    for part, renderings in weighted_renderings(model, rays, training.background, key, tile_points):
+    for part, renderings in weighted_renderings(model, rays, training.objective.background, key, tile_points):
         for name, rendering in zip(names, renderings, strict=True):
             along = weight_along(rendering, part, PARTS, contracted_spacing) * part.near.numel() / num_rays
             seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))

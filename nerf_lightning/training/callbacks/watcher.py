@@ -95,7 +95,7 @@ def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int,
     scene = trainer.datamodule.scene
     views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
-    tile_points = system.step.tile_points or WHOLE_BATCH_POINTS
+    tile_points = system.step.tiles.points or WHOLE_BATCH_POINTS
     system.eval()
     rays = system.rays.at_most(LONGEST_PANEL)
     picture = render_picture(system.model, rays, view, scene.background, tile_points)

@@ -11,9 +11,10 @@ from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import distributed
 
 from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precision
-from nerf_lightning.compute.ranks import processes_here, world_size
+from nerf_lightning.compute.ranks import processes_here
 from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.training.gradients.recorded import not_replayed
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
@@ -42,8 +43,8 @@ class TrainerSettings(ComputeSettings):
         num_threads: PyTorch's threads on the CPU; None: one per available core.
         compile: compile the levels that have static shapes (torch.compile).
         cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves launch overhead; not
-            for refinement and losses that learn. auto: where that is possible, in one process, without parts of your
-            own, which might decide something in Python at each step.
+            for refinement and losses that learn. auto: where that is possible, without parts of your own that do not
+            say that they decide nothing in Python at each step (replays = True).
         deterministic: refuse nondeterministic GPU operations; the CPU has none.
         devices: processes on this machine, one per device, which share each batch; auto: all GPUs. On a TPU: the cores,
             in one process.
@@ -102,12 +103,16 @@ class TrainerSettings(ComputeSettings):
     def records(self, step: TrainStep) -> bool:
         """Tell whether to record a run's steps.
 
-        auto: not several processes', compiled ones, or those of parts of one's own, which nobody has tried.
+        auto: not compiled ones, or those of parts of one's own that do not say whether they can be replayed.
         """
         if self.cuda_graph != "auto":
             return self.cuda_graph
-        tried = self.device_type == "cuda" and world_size() == 1 and not self.compile and not step.has_foreign_parts
-        return tried and step.decided_on_host() is None
+        tried = self.device_type == "cuda" and not self.compile
+        return tried and not not_replayed(step.objective, only_known=True)
+
+    def records_there(self, step: TrainStep) -> bool:
+        """Tell whether to record a run's steps where its weights are: one's own Trainer may have moved them."""
+        return step.device.type == self.device_type and self.records(step)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""

@@ -10,13 +10,14 @@ from support.steps import gradients, make_step
 
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, masked_out
+from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.protocol import split_hash
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.collapse_guard import is_constant
+from nerf_lightning.training.validation import RayErrors
 
 
 def masked(scene, keep):
@@ -44,7 +45,7 @@ class PlainMean(MeanSquaredError):
 def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(tile_points):
     model = tiny_model(density_bias=0.5)
     plain_step = make_step(tile_points, copy.deepcopy(model))
-    plain_step.loss = PlainMean()
+    plain_step.objective.loss = PlainMean()
     plain, losses = gradients(plain_step, ball_scene())
     weighted, weighted_losses = gradients(make_step(tile_points, copy.deepcopy(model)), ball_scene())
     assert torch.equal(weighted, plain)
@@ -59,7 +60,7 @@ def test_the_loss_is_the_mean_over_unmasked_pixels():
     kept = batch.weight > 0
     assert 0 < int(kept.sum()) < 64
     seen = step.gradients(batch)
-    step.loss.forward = lambda renderings, target: {
+    step.objective.loss.forward = lambda renderings, target: {
         "kept": torch.stack([(each.rgb - target.rgb).square()[kept].mean() for each in renderings])
     }
     torch.testing.assert_close(seen.losses, step.gradients(batch).losses)
@@ -100,7 +101,7 @@ def validation_psnr(scene):
     step, errors = make_step(None), RayErrors()
     with torch.no_grad():
         for batch in FixedRays(scene, "val", 200, 64):
-            step.validate(batch, errors)
+            errors.of(step.objective, batch, None)
     return errors.summary()["val/psnr"]
 
 

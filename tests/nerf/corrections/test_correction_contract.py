@@ -26,7 +26,7 @@ def correction_of(option, scene):
 
 def a_step(option, scene, background="white", tile_points=None):
     step = make_step(tile_points, copy.deepcopy(tiny_model(density_bias=0.5)), background)
-    step.correction = correction_of(option, scene)
+    step.objective.correction = correction_of(option, scene)
     return step
 
 
@@ -51,13 +51,13 @@ def test_it_learns_from_the_photographs_that_train_and_only_of_them(option):
     optimizer, loader = step.new_optimizer(), RayBatches(scene, step.progress, 0, 64)
     for _ in range(3):
         step(loader.at(0, step.progress.rays_seen), optimizer)
-    for parameter in step.correction.parameters():
+    for parameter in step.objective.correction.parameters():
         assert float(parameter.detach().abs().max()) > 0
         if len(parameter) == 8:
             trained = torch.zeros(8, dtype=torch.bool).index_fill(0, torch.tensor(scene.splits["train"]), True)
             assert float(parameter.detach()[~trained].abs().sum()) == 0
     step.restart(optimizer)
-    assert all(float(parameter.detach().abs().max()) == 0 for parameter in step.correction.parameters())
+    assert all(float(parameter.detach().abs().max()) == 0 for parameter in step.objective.correction.parameters())
 
 
 @pytest.mark.parametrize("option", LEARNT)
@@ -85,9 +85,9 @@ def test_the_background_looks_the_same_to_all(option, background):
     scene = ball_scene()
     scene = replace(scene, pixels=replace(scene.pixels, rgba=torch.zeros_like(scene.pixels.rgba)))
     step = make_step(None, tiny_model(density_bias=-30.0), background)
-    step.correction = correction_of(option, scene)
+    step.objective.correction = correction_of(option, scene)
     with torch.no_grad():
-        for parameter in step.correction.parameters():
+        for parameter in step.objective.correction.parameters():
             parameter.uniform_(-1, 1)
     seen = step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
     torch.testing.assert_close(seen.rgb, seen.target)
@@ -97,7 +97,7 @@ def test_the_background_looks_the_same_to_all(option, background):
 
 @pytest.mark.parametrize("option", LEARNT)
 def test_pictures_and_validation_show_the_neutral_colours(option):
-    from nerf_lightning.evaluation.metrics import RayErrors
+    from nerf_lightning.training.validation import RayErrors
 
     scene = ball_scene()
     step, errors = a_step(option, scene), []
@@ -105,10 +105,10 @@ def test_pictures_and_validation_show_the_neutral_colours(option):
     pictures = []
     for spread in (0.0, 2.0):
         with torch.no_grad():
-            for parameter in step.correction.parameters():
+            for parameter in step.objective.correction.parameters():
                 parameter.uniform_(-spread, spread)
             seen = RayErrors()
-            step.validate(batch, seen)
+            seen.of(step.objective, batch, None)
         errors.append(torch.cat(seen.parts))
         pictures.append(render_picture(step.model.eval(), step.rays, 0, "white", 4096).rgb)
     assert torch.equal(*pictures)

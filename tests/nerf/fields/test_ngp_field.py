@@ -15,6 +15,7 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.types.points import Points
 
 
@@ -164,4 +165,4 @@ def test_codes_of_no_view_and_one_photograph_are_refused():
     scene = ball_scene(num_views=2)
     scene.splits["train"] = (0,)
     with pytest.raises(InputError, match=r"trains on one photograph.*field\.appearance=0"):
-        build(composed("train", "model=fast_small", *SMALL, "field.appearance=4").model).fit_to(scene)
+        fit_parts(build(composed("train", "model=fast_small", *SMALL, "field.appearance=4").model), scene)

@@ -15,7 +15,7 @@ from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.adam.step import adam_step
+from nerf_lightning.nerf.kernels.adam.op import adam_step
 
 
 @pytest.fixture
@@ -202,3 +202,12 @@ def test_a_flipped_bit_in_a_cached_kernel_changes_no_result(tmp_path):
 )
 def test_those_that_are_known_to_take_something_are_found(kernel, other):
     assert other in {Path(file).name for file in backends._sources(f"nerf_lightning.nerf.kernels.{kernel}")}
+
+
+def test_the_mathematics_holds_no_conditions_for_kernels():
+    """The front of each kernel (`op.py`) knows for what there is one; two files are left."""
+    left = {"nerf/losses/proposal.py", "data/ray_batches.py"}
+    package = Path(backends.__file__).parents[2]
+    outside = (file.relative_to(package) for file in package.rglob("*.py") if "kernels" not in file.parts)
+    words = ("backend_for", "cpu_backend", "cuda_backend")
+    assert {file.as_posix() for file in outside if any(word in (package / file).read_text() for word in words)} == left

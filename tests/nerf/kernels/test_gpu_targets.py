@@ -20,8 +20,8 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
 from nerf_lightning.nerf.kernels.mlp import cuda as mlp
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp as any_mlp
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp_torch
+from nerf_lightning.nerf.kernels.mlp.op import mlp as any_mlp
+from nerf_lightning.nerf.kernels.mlp.op import mlp_torch
 from nerf_lightning.nerf.kernels.ragged import cuda as ragged
 
 KERNELS = {mlp: ["_forward", "_backward"], hash_grid: ["_forward", "_backward"]}
@@ -128,7 +128,7 @@ def test_a_kernel_that_does_not_fit_leaves_the_work_to_torch_and_says_so_once(mo
     points, weights = torch.rand(5, 32), [torch.rand(64, 32), torch.rand(3, 64)]
     expected = mlp_torch(points, weights, "bfloat16")
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
-    monkeypatch.setattr("nerf_lightning.nerf.kernels.mlp.mlp.cuda_backend", lambda module, device: mlp)
+    monkeypatch.setattr("nerf_lightning.nerf.kernels.mlp.op.cuda_backend", lambda module, device: mlp)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             assert torch.equal(any_mlp(points, weights, "bfloat16"), expected)

@@ -6,7 +6,7 @@ from support.scenes import some_rays
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels.march.grid import FARTHEST, MarchState, OccupancyCells, blocks_of, leaps_over
-from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 
 AABB = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])

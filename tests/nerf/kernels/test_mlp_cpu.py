@@ -13,7 +13,7 @@ from support.comparing import far_apart
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.mlp import amx
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
+from nerf_lightning.nerf.kernels.mlp.op import mlp, mlp_torch
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS, cpu_multiplies_bfloat16
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS as TILE
 

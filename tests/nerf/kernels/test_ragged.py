@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nerf_lightning.nerf.kernels.ragged.integrate import integrate, num_visible
+from nerf_lightning.nerf.kernels.ragged.op import integrate, num_visible
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.rendering.quadrature import weights_from_density
 from nerf_lightning.nerf.types.rays import RaggedSamples

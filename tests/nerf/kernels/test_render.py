@@ -13,7 +13,7 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import gradients as kernels
 from nerf_lightning.nerf.kernels.render import workspace
-from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
+from nerf_lightning.nerf.kernels.render.op import has_kernel
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
@@ -137,7 +137,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     weight, background = torch.randn(700, 8), torch.rand(700, 3)
     seen, gradients = learnt(level, rays, random, weight, background)
     asked = int(level.counter.counts[0])
-    level.reset_statistics()
+    level.counter.reset_statistics()
     with without("render.gradients"):
         expected, of_single = learnt(level, rays, random, weight, background)
     assert 0.1 < float(expected[:, 6].mean()) < 0.9

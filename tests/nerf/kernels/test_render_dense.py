@@ -14,6 +14,7 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import workspace
+from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models import dense_level
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
@@ -74,7 +75,7 @@ def compare(level, rays, most, random=None, background=None):
 @pytest.mark.parametrize(("features", "color_layers"), [(2, 1), (4, 2)])
 def test_it_sees_and_learns_what_torch_does(contraction, kind, closed, matmul_precision, most, features, color_layers):
     level = a_level(kind, features=features, color_layers=color_layers, contraction=contraction, scaling=1.5)
-    level.field.set_precision(matmul_precision)
+    set_precision(level.field, matmul_precision)
     background = None if closed else torch.rand(300, 3)
     expected = compare(level, some_rays(300), most, batch_random(3, 300), background)
     assert closed or 0.05 < float(expected[:, -2].mean()) < 0.95
@@ -220,10 +221,10 @@ def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
     level, rays = a_level(ProposalLevel), some_rays(30)
     level.learn_every, level.learn_always = 4, 0
     monkeypatch.setattr(workspace, "_spare", [])
-    level.update(1, 0)
+    level.on_step(StepContext(0.0, 1, 0))
     assert not level(rays, None, [], batch_random(0, 30)).weights.requires_grad
     assert not workspace._spare
-    level.update(4, 0)
+    level.on_step(StepContext(0.0, 4, 0))
     assert level(rays, None, [], batch_random(0, 30)).weights.requires_grad
 
 

@@ -73,7 +73,7 @@ def test_the_threshold_comes_down_to_the_quantile_and_the_passer_by_is_left_out_
     levels = loss([seen(truth)] * 2, target(photograph, weight))["color"]
     # Three quarters of the pixels: none of the passer-by has as many good neighbors as bad ones.
     assert [float(level) for level in levels] == pytest.approx([0.75 * 1e-4] * 2, rel=1e-3)
-    loss.forget()
+    loss.reset_parameters()
     torch.testing.assert_close(loss([seen(truth)] * 2, target(photograph, weight)), plain)
 
 

@@ -8,6 +8,7 @@ from support.scenes import ball_scene
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
+from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.build_step import build_step
@@ -36,7 +37,7 @@ def trained(steps, capacity=None):
     loader, optimizer = RayBatches(scene, progress, 0, 64), step.new_optimizer()
     losses = [step(loader.at(0, progress.rays_seen), optimizer).losses for _ in range(steps)]
     assert step.guard.skipped == 0
-    return losses[-1], step.model.statistics()["train/dropped_samples"]
+    return losses[-1], statistics(step.model)["train/dropped_samples"]
 
 
 def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():

@@ -21,8 +21,10 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
@@ -62,9 +64,8 @@ CASES = [
 
 def a_step(levels, scene, progress, loss):
     return TrainStep(
-        model=levels, rays=rays_of(scene), loss=loss, optimizer=lambda groups: TableAdam(groups, lr=0.02),
-        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=60, seed=0, background="random",
-        tile_points=4096,
+        Objective(levels, rays_of(scene), loss, "random"), optimizer=lambda groups: TableAdam(groups, lr=0.02),
+        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=60, seed=0, tile_points=4096,
     )  # fmt: skip
 
 
@@ -73,7 +74,7 @@ def test_it_learns(model, field, position, direction):
     torch.manual_seed(4)
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     levels = RadianceModel(MODELS[model](lambda: FIELDS[field](POSITIONS[position](), DIRECTIONS[direction]())))
-    levels.fit_to(scene)
+    fit_parts(levels, scene)
     step = a_step(levels, scene, progress, ProposalLoss() if model == "proposal" else MeanSquaredError())
     optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 64)
@@ -93,7 +94,7 @@ def test_every_kind_of_level_learns_known_depths(model):
     distance = scene.cameras.c2w[:, :, 3].norm(dim=-1) - BALL_RADIUS
     scene = replace(scene, depths=KnownDepths(PixelIndex(view, middle, middle), distance, torch.ones(8)))
     levels = RadianceModel(MODELS[model](lambda: FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]())))
-    levels.fit_to(scene)
+    fit_parts(levels, scene)
     plain = ProposalLoss() if model == "proposal" else MeanSquaredError()
     step = a_step(levels, scene, progress, WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}))
     loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), step.new_optimizer(), []
@@ -109,11 +110,10 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
         FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
     )
     model = RadianceModel({"fine": level})
-    model.fit_to(scene)
+    fit_parts(model, scene)
     step = TrainStep(
-        model=model, rays=rays_of(scene), loss=MeanSquaredError(), optimizer=lambda groups: TableAdam(groups),
-        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, background="white",
-        sample_budget=1000,
+        Objective(model, rays_of(scene), MeanSquaredError(), "white"), optimizer=lambda groups: TableAdam(groups),
+        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, sample_budget=1000,
     )  # fmt: skip
     optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 512)

@@ -6,13 +6,14 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from support.static_models import fast_model
 
-from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
+from nerf_lightning.nerf.kernels.ragged.op import num_visible
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.part import StepContext, begin_step, fit_parts, statistics
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.ragged import first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
@@ -49,7 +50,7 @@ def test_tiles_cover_the_batch_evenly():
 def test_after_the_first_steps_proposals_learn_now_and_then(step, learns):
     proposal = ProposalLevel(StratifiedSampler(8), tiny_field(), learn_every=4, learn_always=10)
     rays = some_rays(5)
-    proposal.update(step, key=0)
+    proposal.on_step(StepContext(0.0, step, 0))
     rendering = proposal(rays, None, [], batch_random(0, 5, rays.near.device))
     assert rendering.weights.requires_grad == learns
     again = ProposalLevel(StratifiedSampler(8), proposal.field)
@@ -62,14 +63,14 @@ def both(**sampler):
     packed, masked = (
         fast_model(level, num_steps=96, **({"opaque_below": 0.0} | sampler)) for level in (RaggedLevel, MaskedLevel)
     )
-    packed.fit_to(scene)
+    fit_parts(packed, scene)
     torch.nn.init.normal_(packed.levels["fine"].field.position_encoder.table, std=1.0)
     for step in (4, 8, 12):
-        packed.update(step, step)
+        begin_step(packed, StepContext(0.0, step, step))
     grid = packed.levels["fine"].sampler.grid
     grid.occupy(grid.density > grid.density.quantile(0.7))
     state = packed.state_dict()
-    masked.fit_to(scene)
+    fit_parts(masked, scene)
     masked.load_state_dict({key: state[key] for key in masked.state_dict()})
     return packed, masked
 
@@ -107,10 +108,10 @@ def test_the_grid_keeps_up_with_the_field():
     packed, masked = both()
     for model in (packed, masked):
         for step in (16, 20):
-            model.update(step, step)
+            begin_step(model, StepContext(0.0, step, step))
     pairs = zip(packed.levels["fine"].sampler.buffers(), masked.levels["fine"].sampler.buffers(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
-    assert masked.statistics()["train/occupied"] == packed.statistics()["train/occupied"]
+    assert statistics(masked)["train/occupied"] == statistics(packed)["train/occupied"]
 
 
 def a_level(**settings):
@@ -118,7 +119,7 @@ def a_level(**settings):
     field = tiny_field(density_activation="softplus", density_bias=1.0)
     sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
     level = RaggedLevel(sampler, field)
-    level.fit_to(ball_scene(num_views=12))
+    fit_parts(level, ball_scene(num_views=12))
     level.sampler.grid.occupy(torch.ones_like(level.sampler.grid.possible))
     return level
 
@@ -223,12 +224,12 @@ def test_samples_per_ray_are_measured_kept_and_loaded():
     model = RadianceModel({"fine": level})
     assert model.points_per_ray(training=True) == 200  # nothing known yet: the most there can be
     model(some_rays(50), torch.ones(50, 3), batch_random(0, 50))
-    model.update(16, 0)
+    begin_step(model, StepContext(0.0, 16, 0))
     counted = model.points_per_ray(training=True)
     assert 5 < counted < 150
     other = RadianceModel({"fine": a_level()})
     other.load_state_dict(model.state_dict())
     assert other.points_per_ray(training=True) == counted
-    assert model.statistics()["speed/samples_per_ray"] == pytest.approx(counted)
-    model.reset_statistics()
+    assert statistics(model)["speed/samples_per_ray"] == pytest.approx(counted)
+    model.last.counter.reset_statistics()
     assert model.points_per_ray(training=True) == 200

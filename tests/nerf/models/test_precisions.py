@@ -9,8 +9,11 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models.base import show_photographs
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
@@ -34,14 +37,14 @@ def trained(name, scene):
         config.model.levels.fine.sampler.update(resolution=32, num_steps=128)  # carved in a moment
     model, loss = build(config.model), build(config.loss)
     assert isinstance(loss, Loss)
-    model.fit_to(scene)
+    fit_parts(model, scene)
     show_photographs(model, scene)
     progress, (steps, rays, _) = Progress(), LESS.get(name, (STEPS, RAYS, SIDE))
     step = TrainStep(
-        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, background_of(name),
-        TILE_POINTS, num_steps=steps,
+        Objective(model, rays_of(scene), loss, background_of(name)), build(config.optimizer), build(config.scheduler),
+        progress, 2, TILE_POINTS, num_steps=steps,
     )  # fmt: skip
-    model.set_precision("bfloat16")
+    set_precision(model, "bfloat16")
     batches, optimizer = RayBatches(scene, progress, 0, rays), step.new_optimizer()
     for _ in range(steps):
         step(batches.at(0, progress.rays_seen), optimizer)
@@ -65,7 +68,7 @@ def test_weights_see_the_same_in_both_precisions(name):
     scene = ball_scene(num_views=24 if name in LOOKING else 4, size=side)
     model, found = trained(name, scene), {}
     for matmul_precision in ("float32", "bfloat16"):
-        model.set_precision(matmul_precision)
+        set_precision(model, matmul_precision)
         measured = []
         for view in SEEN_FROM:
             picture = render_picture(model, rays_of(scene), view, "white", TILE_POINTS)

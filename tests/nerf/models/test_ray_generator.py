@@ -8,10 +8,10 @@ from support.scenes import ball_scene, tiny_model
 from support.steps import make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.training.validation import RayErrors
 
 
 def test_a_pixel_has_the_ray_of_its_camera_and_rays_through_the_world_are_not_bent():
@@ -47,7 +47,7 @@ def test_cameras_can_learn_in_tiles_and_whole():
     scene, shifts = ball_scene(), []
     for tile_points in (None, 200):
         step = make_step(tile_points)
-        step.rays = LearntShifts(scene.cameras, scene.near, scene.far)
+        step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far)
         step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
         optimizer = step.new_optimizer()
         step(RayBatches(scene, step.progress, 0, 64).at(0, 0), optimizer)
@@ -69,5 +69,5 @@ def test_a_training_step_says_which_photograph_it_explains_and_validation_does_n
     batch = RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
     step(batch, step.new_optimizer())
     assert torch.equal(seen[0], batch.pixels.view)
-    step.validate(batch, RayErrors())
+    RayErrors().of(step.objective, batch, None)
     assert seen[1] is None

@@ -20,6 +20,7 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import PixelStore
@@ -63,7 +64,7 @@ def through_all_at_once(offset, model, generator, view):
 def test_a_picture_has_the_bits_that_all_its_rays_at_once_gave_it(name, per_side, space, monkeypatch):
     monkeypatch.setattr(render_image, "threads_on", lambda device: 1)
     model, generator = tiny_model(density_bias=0.5).eval(), RayGenerator(CAMERAS[name], SCENE.near, SCENE.far)
-    model.fit_to(replace(SCENE, space=space))
+    fit_parts(model, replace(SCENE, space=space))
     model.subpixels._now = per_side
     parts = [through_all_at_once(offset, model, generator, 1) for offset in model.subpixels.offsets()]
     picture = render_picture(model, generator, 1, "white", TILE)

@@ -19,7 +19,8 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray, mean_over_pixels, random_of_rays
-from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import StepContext, fit_parts
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import blend
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -158,7 +159,7 @@ def model_with(side, start=0.0, density_bias=0.5):
     torch.manual_seed(3)
     plain = tiny_model(density_bias=density_bias)
     model = RadianceModel(dict(plain.levels.items()), subpixels=side, subpixels_from=start)
-    model.fit_to(ball_scene())
+    fit_parts(model, ball_scene())
     return model
 
 
@@ -256,5 +257,6 @@ def test_losses_that_look_at_samples_and_sides_out_of_range_are_refused_by_name(
     step = make_step(None)
     with pytest.raises(InputError, match=r"model\.subpixels=2 .* ProposalLoss looks at the samples"):
         TrainStep(
-            model_with(2), step.rays, ProposalLoss(), step.build_optimizer, step.schedule, step.progress, 0, "white"
+            Objective(model_with(2), step.rays, ProposalLoss(), "white"),
+            *(step.build_optimizer, step.schedule, step.progress, 0),
         )

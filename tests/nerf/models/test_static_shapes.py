@@ -12,6 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.part import StepContext, begin_step
 from nerf_lightning.nerf.types.progress import Progress
 
 
@@ -35,7 +36,7 @@ def operations_of_steps(name, steps, model=None, loss=None):
     step = static_system(name, scene, progress, 100, model, loss).step
     loader = RayBatches(scene, progress, 0, 64)
     # What is read once in a run (switches, the grid's content) is read on the host.
-    step.model.update(4, 0)
+    begin_step(step.model, StepContext(0.0, 4, 0))
     step.model(step.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)
     optimizer = step.to(torch.device("meta")).new_optimizer()
     lists = []

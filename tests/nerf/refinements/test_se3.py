@@ -22,7 +22,7 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
-from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.part import StepContext, fit_parts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.refinements.base import NoRefinement
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
@@ -37,9 +37,9 @@ from nerf_lightning.nerf.types.rays import PixelIndex
 
 def a_step(scene, refinement, model=None):
     step = make_step(None, model, background=scene.background)
-    step.model.fit_to(scene)
+    fit_parts(step.model, scene)
     refinement.fit_to(scene)
-    step.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    step.objective.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
     return step
 
 

@@ -5,6 +5,7 @@ import torch
 from support.scenes import ball_scene, some_rays, tiny_field
 
 from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.rendering.linear_light import KNEE, scale_light, to_linear
@@ -108,5 +109,5 @@ def test_in_normalised_device_coordinates_no_distance_is_one(ndc):
     scene = ball_scene()
     scale = torch.ones(len(scene.cameras.c2w), 2) if ndc else None
     level = DenseLevel(StratifiedSampler(8), tiny_field(), 2.0)
-    level.fit_to(replace(scene, cameras=replace(scene.cameras, ndc=scale)))
+    fit_parts(level, replace(scene, cameras=replace(scene.cameras, ndc=scale)))
     assert level.gradient_scaling_distance == (0.0 if ndc else 2.0)

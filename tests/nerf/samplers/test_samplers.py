@@ -190,7 +190,7 @@ def ball_density(radius=0.5, density=80.0):
 
 def learn(sampler, density_fn, steps=320):
     for step in range(16, steps + 1, 16):
-        sampler.update(density_fn, step, fold(0, 0, step))
+        sampler.learn(density_fn, step, fold(0, 0, step))
     return sampler
 
 
@@ -212,7 +212,7 @@ def test_matter_that_grows_later_is_found_again():
     sampler = learn(a_sampler(), ball_density(radius=0.2))
     before = int(sampler.grid.cells.sum())
     for step in range(400, 700, 16):
-        sampler.update(ball_density(radius=0.6), step, fold(0, 0, step))
+        sampler.learn(ball_density(radius=0.6), step, fold(0, 0, step))
     assert int(sampler.grid.cells.sum()) > 5 * before
 
 
@@ -220,15 +220,15 @@ def test_nothing_is_given_up_before_its_time():
     """Dark content on a black background: its density grows late, and must not be pruned first."""
     sampler = a_sampler(prune_after=100)
     for step in (16, 32, 96):
-        sampler.update(ball_density(density=0.0), step, step)
+        sampler.learn(ball_density(density=0.0), step, step)
     assert bool(sampler.grid.cells.all())
-    sampler.update(ball_density(), 112, 112)
+    sampler.learn(ball_density(), 112, 112)
     assert not bool(sampler.grid.cells.all())
 
 
 def test_a_density_that_is_the_same_everywhere_prunes_nothing():
     sampler = a_sampler()
-    sampler.update(lambda positions: torch.full(positions.shape[:-1], 0.3), 16, 5)
+    sampler.learn(lambda positions: torch.full(positions.shape[:-1], 0.3), 16, 5)
     assert bool(sampler.grid.cells.all())
 
 

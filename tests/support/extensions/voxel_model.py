@@ -32,7 +32,6 @@ class VoxelModel(PointField):
         return ("grid",)
 
     def fit_to(self, scene):
-        self.sampler.fit_to(scene)
         self.aabb.copy_(scene.aabb)
 
     def forward(self, rays, background, random):
@@ -54,6 +53,3 @@ class VoxelModel(PointField):
 
     def reset_parameters(self):
         nn.init.normal_(self.grid, std=0.1)
-
-    def set_precision(self, matmul_precision):
-        pass

@@ -6,10 +6,10 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard, is_constant
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.launch.preemption import stop_signals
-from nerf_lightning.training.step_output import StepOutput
 
 
 class StubTrainer(Trainer):

@@ -13,10 +13,12 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.part import fit_parts
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.monitor import level_scalars
 from nerf_lightning.training.callbacks.ray_histograms import PARTS, look_along, write_shares
@@ -46,13 +48,13 @@ def test_the_psnr_is_that_of_the_colours_whatever_the_loss_is(model, loss):
     config = composed("train", f"model={model}", *small, *([] if loss == "L1" else [f"loss={loss}"]))
     scene, progress = ball_scene(num_views=8, size=16), Progress()
     built = build(config.model)
-    built.fit_to(scene)
+    fit_parts(built, scene)
     step = TrainStep(
-        built, rays_of(scene), L1() if loss == "L1" else build(config.loss), lambda groups: torch.optim.Adam(groups),
-        ExponentialDecay(), progress, 0, "white", 4096, num_steps=100,
+        Objective(built, rays_of(scene), L1() if loss == "L1" else build(config.loss), "white"),
+        lambda groups: torch.optim.Adam(groups), ExponentialDecay(), progress, 0, 4096, num_steps=100,
     )  # fmt: skip
     if loss == "robust":
-        step.loss.threshold.fill_(0.01)  # at first it leaves nothing out
+        step.objective.loss.threshold.fill_(0.01)  # at first it leaves nothing out
     batch = RayBatches(scene, progress, 0, 128).at(0, 0)
     seen = step.gradients(batch)
     error = (seen.rgb - seen.target).square().mean()
@@ -90,7 +92,7 @@ def test_looking_changes_nothing_that_training_reads(name):
 def test_tiles_do_not_show(name):
     step, batch = a_system(name)
     whole = look_along(step, batch.pixels, 7, contracted_spacing=False)
-    step.tile_points = 300
+    step.tiles.points = 300
     parts = look_along(step, batch.pixels, 7, contracted_spacing=False)
     assert list(whole) == list(step.model.level_names)
     for level in whole:

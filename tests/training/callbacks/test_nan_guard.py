@@ -13,6 +13,7 @@ from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
@@ -41,7 +42,7 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
     optimizer = optimizer or partial(torch.optim.Adam, lr=0.01)
     schedule = ExponentialDecay(decay_rate=1.0, decay_steps=1)
     model = tiny_model(density_bias=0.5)
-    step_of_training = TrainStep(model, rays_of(scene), loss, optimizer, schedule, progress, 0, "white")
+    step_of_training = TrainStep(Objective(model, rays_of(scene), loss, "white"), optimizer, schedule, progress, 0)
     system = RadianceFieldSystem(step_of_training, record)
     loss.step, loss.until, loss.limit, loss.holder = step, until, limit, (system,)
     data = RayDataModule(scene, progress, 0, batch_rays=16, crop_steps=3, val_rays=16)

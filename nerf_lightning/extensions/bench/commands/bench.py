@@ -60,7 +60,7 @@ def run(config: DictConfig) -> float:
     }
     result |= {
         "machine": bench.settings.describe(),
-        "tile_points": None if bench.step.records else bench.settings.tile_points,
+        "tile_points": None if bench.step.recorded else bench.settings.tile_points,
         "batch_rays": bench.batch.num_rays,
         "training_flops_per_ray": flops,
         "peak_memory_gigabytes": peak,
@@ -108,7 +108,7 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "loaded": loaded_steps,
         "render": partial(bench.render, render_rays),
         "render_plain": partial(bench.render, render_rays, plain=True),
-        **({"one by one": partial(bench.train_one_by_one, steps)} if bench.step.records else {}),
+        **({"one by one": partial(bench.train_one_by_one, steps)} if bench.step.recorded else {}),
         **{f"train on {count}": partial(_on_threads, count, partial(bench.train, steps)) for count in threads},
     }
     seconds = _interleaved(kinds, config.rounds)
@@ -127,7 +127,7 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "rendering rays/s": render_rays / seconds["render"],
         "rendering, times plain float32": seconds["render_plain"] / seconds["render"],
     }
-    if bench.step.records:
+    if bench.step.recorded:
         rows["training, times kernels launched one by one"] = seconds["one by one"] / train
     stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
     for name in stages[0]:

@@ -15,6 +15,7 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
@@ -66,7 +67,7 @@ def test_every_level_tells_the_factor_of_the_cones(kind):
     field = NGPField(an_encoder(cones=True), SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
     sampler = StratifiedSampler(12) if kind is DenseLevel else OccupancySampler(resolution=8, num_steps=64)
     level = kind(sampler, field).eval()
-    level.fit_to(ball_scene(num_views=12))
+    fit_parts(level, ball_scene(num_views=12))
     rays = replace(some_rays(40), pixel_side=torch.tensor([0.0, 0.02]).expand(40, 2))
     wide, thin = (level(replace(rays, pixel_side=size * rays.pixel_side), None, [], None).rgb for size in (1.0, 0.1))
     assert float((wide - thin).detach().abs().max()) > 5e-5

@@ -21,6 +21,7 @@ from nerf_lightning.extensions.pruning.quantized_weights import quantized_weight
 from nerf_lightning.extensions.pruning.selection import Neurons, choose, coreset, importance
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.points import Points
 
@@ -66,7 +67,7 @@ def test_rays_see_the_same_whatever_stands_where_they_look_nothing_up():
     torch.manual_seed(3)
     small = ("encoder.log2_table_size=12", "encoder.num_levels=3", "encoder.max_resolution=32", "field.width=16")
     model = build(composed("train", "model=fast_small", *small, "model.levels.fine.sampler.resolution=12").model).eval()
-    model.fit_to(ball_scene())
+    fit_parts(model, ball_scene())
     table, rays = model.last.field.position_encoder.table, some_rays(200)
     torch.nn.init.normal_(table)
     model.last.sampler.grid.occupy(torch.rand(12, 12, 12) < 0.01)

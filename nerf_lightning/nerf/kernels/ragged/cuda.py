@@ -1,7 +1,7 @@
 """Volume rendering for CUDA: a program sums along a ray, 32 samples at a time.
 
 Where all rays have equally many samples, `starts` and `ends` are views of their fenceposts, and there are no bounds.
-Letters as in `kernels.ragged.integrate`. Sums along a ray have a fixed order, so the results are the same in each run.
+Letters as in `kernels.ragged.op`. Sums along a ray have a fixed order, so the results are the same in each run.
 `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 

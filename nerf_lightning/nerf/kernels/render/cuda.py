@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
-from nerf_lightning.nerf.kernels.mlp.mlp import mlp
-from nerf_lightning.nerf.kernels.ragged.integrate import Integrated, integrate, integrate_dense
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
+from nerf_lightning.nerf.kernels.mlp.op import mlp
+from nerf_lightning.nerf.kernels.ragged.op import Integrated, integrate, integrate_dense
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples

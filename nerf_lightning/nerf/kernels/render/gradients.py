@@ -4,7 +4,7 @@ As in `cpu.py` ROWS samples are taken at a time, but of fewer rays: each takes s
 What the way back needs is kept block by block. It takes the blocks from the last to the first, so that of each ray
 those samples come first that lie farthest, and sums up what lies behind each.
 
-Letters as in `kernels.ragged.integrate`. Where the samples lie has no gradient.
+Letters as in `kernels.ragged.op`. Where the samples lie has no gradient.
 """
 
 from itertools import pairwise
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
+from nerf_lightning.nerf.kernels.hash_grid.op import table_gradient
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
 from nerf_lightning.nerf.kernels.march.grid import GridMarch
-from nerf_lightning.nerf.kernels.ragged.integrate import Integrated
+from nerf_lightning.nerf.kernels.ragged.op import Integrated
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples

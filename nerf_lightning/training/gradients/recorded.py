@@ -5,25 +5,30 @@ than the GPU to compute. A replayed graph asks once (https://pytorch.org/blog/ac
 
 What is recorded is what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
 of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and what
-a model decides on the host between two steps has recordings of its own (`Model.step_variant`).
+a model decides on the host between two steps has recordings of its own (`Part.step_variant`).
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import Parameter
 
+from nerf_lightning.compute import ranks
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import parts_of, sample_counts
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.step_output import StepOutput
+from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.training.gradients.tiles import Share, TileGradients
+from nerf_lightning.training.step_guard import StepGuard
 
+KNOWN = (__name__.partition(".")[0], "torch")
+"""Packages of whose modules it is known whether a recorded step follows them."""
 # The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
 WARM_UPS = 3
 
-Gradients = Callable[[Batch, Tensor, Tensor], StepOutput]
-"""Takes a batch, the sum of the weights of all of its shares, and the step's key; leaves gradients in parameters."""
 Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOutput]]
 """Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
 
@@ -55,26 +60,29 @@ class _Recording:
 
 
 class RecordedGradients:
-    """Compute the gradients of batches by replaying the first of their size and the model's variant.
+    """Compute the gradients of batches, whole, by replaying the first of their size and the parts' variants.
 
     Args:
-        compute: the work.
-        parameters: all that learn.
-        counts: returns the buffers that the work adds to, which are put back after it was tried.
-        variant: returns which of several sequences of kernels the model asks for in this step.
+        tiles: computes them.
+        guard: sets those of a step to zero that are not finite, where one process has all of them.
+        share_of: returns this process's part of a batch, given the sum of the weights of all of it.
         record: makes a recording.
+
+    Raises:
+        InputError: something here decides on the host what a step computes.
     """
 
     def __init__(
-        self,
-        compute: Gradients,
-        parameters: Sequence[Parameter],
-        counts: Callable[[], Sequence[Tensor]],
-        variant: Callable[[], Hashable],
-        record: Recorder = cuda_graph,
+        self, tiles: TileGradients, guard: StepGuard, share_of: Callable[[Tensor], Share], record: Recorder = cuda_graph
     ):
-        self.compute, self.parameters, self.counts = compute, parameters, counts
-        self.variant, self.record = variant, record
+        if kinds := not_replayed(tiles.objective):
+            raise InputError(
+                "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
+                f"step: {', '.join(kinds)}. Leave it out."
+            )
+        self.tiles, self.guard, self.share_of, self.record = tiles, guard, share_of, record
+        self.parts, self.parameters = list(parts_of(tiles.objective)), list(tiles.objective.parameters())
+        self.guards = ranks.world_size() == 1  # else the gradients of all are added up first
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
     def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: int) -> StepOutput:
@@ -82,7 +90,7 @@ class RecordedGradients:
 
         Both are written over by the next call.
         """
-        kind = batch.num_rays, self.variant()
+        kind = batch.num_rays, tuple(part.step_variant for part in self.parts)
         if kind not in self.recordings:
             self.recordings[kind] = self._recorded(batch, weight, key)
         kept = self.recordings[kind]
@@ -99,19 +107,23 @@ class RecordedGradients:
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-        before = [count.clone() for count in self.counts()]
+        counts = [*sample_counts(self.tiles.objective), *self.guard.tensors(weight.device)]
+        before = [count.clone() for count in counts]
 
         def work() -> StepOutput:
             for parameter in self.parameters:
                 # Others begin with zeros: the optimizer leaves them so (`optimizers.table_adam`).
                 if parameter.grad is not None and not getattr(parameter, "grad_in_place", False):
                     parameter.grad.zero_()
-            return self.compute(batch, weight, kept_key)
+            seen = self.tiles.in_tiles_of(batch.num_rays, batch, self.share_of(weight), kept_key)
+            if self.guards:
+                self.guard.keep_finite(seen.losses, self.tiles.objective.named_weights())
+            return seen
 
         try:
             replay, seen = self.record(work)
         finally:
-            for count, former in zip(self.counts(), before, strict=True):
+            for count, former in zip(counts, before, strict=True):
                 count.copy_(former)
         for parameter in self.parameters:
             if parameter.grad is not None:
@@ -124,3 +136,19 @@ def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
     for dtype in {each.dtype for each in targets}:
         ours, theirs = ([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources))
         torch._foreach_copy_(ours, theirs)
+
+
+def not_replayed(objective: Objective, only_known: bool = False) -> list[str]:
+    """Return the classes of those parts whose steps a recording would not follow, each once.
+
+    Args:
+        objective: what would be recorded.
+        only_known: those of somebody else's classes, too, that do not say themselves whether it would (`Part.replays`).
+    """
+    found = {}
+    for module in objective.modules():
+        kind = type(module)
+        unknown = kind.__module__.partition(".")[0] not in KNOWN and "replays" not in vars(kind)
+        if not getattr(module, "replays", True) or (only_known and unknown):
+            found[kind.__name__] = True
+    return list(found)

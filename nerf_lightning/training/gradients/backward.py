@@ -5,80 +5,50 @@ backward, are almost twice as fast as one, where two threads in every operation 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, add_all, defer_table_grads
+from nerf_lightning.nerf.kernels.hash_grid.op import TableGradient, add_all, defer_table_grads
 from nerf_lightning.nerf.kernels.threads import in_parallel
-from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+from nerf_lightning.nerf.types.step_output import StepOutput
 
 Backward = Callable[[Tensor], None]
-
-
-@dataclass(frozen=True)
-class TileLoss(TensorStruct):
-    """What a tile of rays adds to the loss of its batch."""
-
-    levels: Float[Tensor, "levels"]
-    """Each level's loss."""
-    terms: dict[str, Float[Tensor, "levels"]]
-    """The same by term, detached."""
-    errors: Float[Tensor, "levels"]
-    """Each level's mean squared error of color, whatever its loss is; of one that shows none it means nothing."""
-    foreground: Float[Tensor, "rays 3"]
-    """The light of its rays without the background's."""
-    rgb: Float[Tensor, "rays 3"]
-    """What was compared with the photographs."""
-
-    @classmethod
-    def joined(cls, tiles: Sequence["TileLoss"]) -> "TileLoss":
-        """Return what tiles add up to, their rays one after the other."""
-        if len(tiles) == 1:
-            return tiles[0]
-        return cls(
-            levels=torch.stack([each.levels for each in tiles]).sum(0),
-            terms={name: torch.stack([each.terms[name] for each in tiles]).sum(0) for name in tiles[0].terms},
-            errors=torch.stack([each.errors for each in tiles]).sum(0),
-            foreground=torch.cat([each.foreground for each in tiles]),
-            rgb=torch.cat([each.rgb for each in tiles]),
-        )
+"""Adds the gradients of a loss to those of the parameters."""
 
 
 def sequential_backward(
-    lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward
-) -> list[TileLoss]:
+    lose: Callable[[slice], StepOutput], tiles: Sequence[slice], backward: Backward
+) -> list[StepOutput]:
     """Send one tile after the other forward and backward, and return what they have lost, in order."""
     losses = []
     for tile in tiles:
         lost = lose(tile)
-        backward(lost.levels.sum())
+        backward(lost.losses.sum())
         losses.append(lost.map(Tensor.detach))
     return losses
 
 
 def parallel_backward(
-    lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward, parameters: Sequence[Parameter]
-) -> list[TileLoss]:
+    lose: Callable[[slice], StepOutput], tiles: Sequence[slice], backward: Backward, parameters: Sequence[Parameter]
+) -> list[StepOutput]:
     """Do the same on as many threads as torch has; sums are taken in the order of the tiles, so their bits are fixed.
 
     `backward` is called once, with the loss of all tiles, and hands on the gradients that the threads have found.
     """
     learnt = [parameter for parameter in parameters if parameter.requires_grad]
 
-    def work(tile: slice) -> tuple[TileLoss, Sequence[Tensor | None], Sequence[TableGradient]]:
+    def work(tile: slice) -> tuple[StepOutput, Sequence[Tensor | None], Sequence[TableGradient]]:
         with defer_table_grads() as held:
             lost = lose(tile)
-            gradients = torch.autograd.grad(lost.levels.sum(), learnt, allow_unused=True)
+            gradients = torch.autograd.grad(lost.losses.sum(), learnt, allow_unused=True)
         return lost.map(Tensor.detach), gradients, held
 
     found = in_parallel(work, tiles)
     losses = [lost for lost, _, _ in found]
-    total = torch.stack([lost.levels for lost in losses]).sum()
+    total = torch.stack([lost.losses for lost in losses]).sum()
     held = [each for _, _, of_tile in found for each in of_tile]
     sums = [_sum([gradients[number] for _, gradients, _ in found]) for number in range(len(learnt))]
     backward(_PrecomputedGradients.apply(total, sums, held, *learnt))

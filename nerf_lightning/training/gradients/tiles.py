@@ -1,0 +1,130 @@
+"""Gradients of a share of a step's batch, tile by tile; smaller tiles where there is no memory for these.
+
+What a tile of rays needs stays in the cache, and the sum of the tiles' gradients is the whole batch's up to rounding.
+"""
+
+import logging
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
+from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
+from nerf_lightning.nerf.models.tiles import is_out_of_memory, pixels_in_tile, tiles
+from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.part import sample_counts
+from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.training.gradients.backward import Backward, parallel_backward, sequential_backward
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A process's part of a step's batch."""
+
+    first: int
+    """Its first ray's slot in the batch."""
+    num_rays: int
+    """Rays of the whole batch."""
+    weight: Tensor
+    """Sum of the weights of the whole batch."""
+
+
+def torch_backward(loss: Tensor) -> None:
+    """Add a loss's gradients to the parameters'."""
+    loss.backward()
+
+
+class TileGradients:
+    """Send batches forward and backward in tiles.
+
+    Args:
+        objective: the loss.
+        points: most points that a tile may send through a field at once; None: the whole batch is a tile.
+        jitter: False: no random numbers.
+    """
+
+    def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
+        self.objective, self.points, self.jitter = objective, points, jitter
+
+    def __call__(
+        self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
+    ) -> StepOutput:
+        """Add a batch's gradients to the parameters'.
+
+        Args:
+            batch: pixels, colors, weights.
+            key: of the step's random numbers.
+            share: what part of the step's batch this is; None: all of it.
+            backward: adds a loss's gradients to the parameters'.
+
+        Returns:
+            What this share saw; its losses and errors add up over all shares to the batch's.
+
+        Raises:
+            InputError: there is no memory for the smallest tiles.
+        """
+        share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
+        with self.on_threads(batch.weight.device):
+            while True:
+                counts = [count.clone() for count in sample_counts(self.objective)]
+                try:
+                    return self.in_tiles_of(self._pixels_in_tile(batch), batch, share, key, backward)
+                except RuntimeError as error:
+                    if not is_out_of_memory(error):
+                        raise
+                    forget_workspaces()
+                    self._take_smaller_tiles(batch, error)
+                self.objective.zero_grad(set_to_none=False)
+                for count, before in zip(sample_counts(self.objective), counts, strict=True):
+                    count.copy_(before)
+
+    def in_tiles_of(
+        self, num_pixels: int, batch: Batch, share: Share, key: int | Tensor, backward: Backward = torch_backward
+    ) -> StepOutput:
+        """Add a batch's gradients, in tiles of so many pixels; without a look at the memory."""
+        objective, device = self.objective, batch.weight.device
+        random = batch_random(key, batch.num_rays, device, share.first) if self.jitter else None
+        # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
+        weight_scale = share.num_rays / share.weight.clamp(min=1.0)
+
+        def lose(tile: slice) -> StepOutput:
+            # Cameras that learn are asked in each tile, since its backward pass ends in them.
+            seen = objective(batch[tile], None if random is None else random[tile], weight_scale)
+            return seen.scaled((tile.stop - tile.start) / share.num_rays)
+
+        together, threads = objective.together, 1 if self.points is None else threads_on(device)
+        learns_cameras = objective.rays.refinement.moves()
+        if threads > 1 and not objective.model.takes_whole_rays(device, training=True, learns_cameras=learns_cameras):
+            parts = list(tiles(batch.num_rays, num_pixels, together, multiple=threads))
+            seen = parallel_backward(lose, parts, backward, list(objective.parameters()))
+        else:
+            seen = sequential_backward(lose, list(tiles(batch.num_rays, threads * num_pixels, together)), backward)
+        for penalty in objective.penalties():
+            backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
+        return StepOutput.joined(seen)
+
+    def on_threads(self, device: torch.device) -> AbstractContextManager[None]:
+        """Return a context for steps: whole batches are for torch's threads, tiles are shared out here."""
+        return torch_on_one_thread() if self.points is not None and device.type == "cpu" else nullcontext()
+
+    def _pixels_in_tile(self, batch: Batch) -> int:
+        if self.points is None:
+            return batch.num_rays
+        return pixels_in_tile(self.objective.model, self.points, training=True)
+
+    def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
+        if self.points is None or self._pixels_in_tile(batch) <= self.objective.together:
+            raise InputError(
+                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
+                "or tiles (trainer.tile_points=auto)."
+            ) from error
+        points = batch.num_rays * self.objective.model.points_per_ray(training=True)
+        self.points = int(min(self.points, points)) // 2
+        log.warning("out of memory: reducing tiles to %d points and repeating the step", self.points)
