@@ -16,7 +16,7 @@ from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels,
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.rays import Batch, PixelIndex, Target
+from nerf_lightning.nerf.types.rays import Batch, PixelIndex, RayBundle, Target
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.step_output import StepOutput
@@ -64,7 +64,8 @@ class Objective(Part):
         """
         background = self._background(batch, random)
         target = self._target(batch, background, weight_scale)
-        renderings = self._render(batch.pixels, background, random, photograph=batch.pixels.view)
+        rays, target = self.loss.rays_to_render(self._rays(batch.pixels, batch.pixels.view), target, random)
+        renderings = self._render(rays, background, random)
         shown = [self.correction.photographed(rendering, batch.pixels) for rendering in renderings]
         terms = self.loss(shown, target) | _penalties_of_levels(renderings)
         losses = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
@@ -84,7 +85,7 @@ class Objective(Part):
     def neutral(self, batch: Batch) -> tuple[list[Rendering], Target]:
         """Return pixels as evaluation shows them, and their target: no randomness, no photograph's codes or colors."""
         background = self._background(batch, None)
-        return self._render(batch.pixels, background, None), self._target(batch, background)
+        return self._render(self._rays(batch.pixels), background, None), self._target(batch, background)
 
     def named_weights(self) -> Iterator[tuple[str, Tensor]]:
         """Return all parameters by name, those of the model by the names that they have there."""
@@ -94,18 +95,16 @@ class Objective(Part):
         """Return what parts add to the loss of a whole step, whatever its pixels are."""
         return (penalty for part in parts_of(self) if (penalty := part.penalty()) is not None)
 
+    def _rays(self, pixels: PixelIndex, photograph: Int[Tensor, "pixels"] | None = None) -> RayBundle:
+        several = self.model.subpixels
+        rays = self.rays.of_pixels(pixels, several)
+        return rays if photograph is None else replace(rays, photograph=for_each_ray(photograph, several.per_pixel))
+
     def _render(
-        self,
-        pixels: PixelIndex,
-        background: Float[Tensor, "pixels 3"] | None,
-        random: RayRandom | None,
-        photograph: Int[Tensor, "pixels"] | None = None,
+        self, rays: RayBundle, background: Float[Tensor, "pixels 3"] | None, random: RayRandom | None
     ) -> list[Rendering]:
         """Return one rendering per level: the mean of each pixel's rays."""
         several = self.model.subpixels
-        rays = self.rays.of_pixels(pixels, several)
-        if photograph is not None:
-            rays = replace(rays, photograph=for_each_ray(photograph, several.per_pixel))
         behind = None if background is None else for_each_ray(background, several.per_pixel)
         numbers = None if random is None else random_of_rays(random, several.per_pixel)
         return [mean_over_pixels(rendering, several.per_pixel) for rendering in self.model(rays, behind, numbers)]

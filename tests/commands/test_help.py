@@ -46,7 +46,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
     assert "in the capture's units; null: from the capture." in told
-    assert "With scene=blender" in told
+    assert "With scene=auto, scene=blender" in told
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ KINDS = {
     ),
     "blender": Kind(
         lambda f: write_blender(f / "capture", {"train": 3, "val": 1, "test": 1}),
-        lambda f: usable(BlenderReader(str(f / "capture")).read()),
+        lambda f: usable(BlenderReader(str(f / "capture"), cache_dir=str(f / "cache")).read()),
         ("capture/transforms_train.json", "capture/train/r_1.png"),
     ),
     "colmap": Kind(
@@ -144,7 +144,7 @@ KINDS = {
     "llff": Kind(lambda f: write_llff(f / "capture", KNOWN), capture("llff"), ("capture/poses_bounds.npy",)),
     "npz": Kind(
         lambda f: np.savez(f / "a.npz", **npz_content(count=4)),
-        lambda f: usable(NpzReader(str(f / "a.npz")).read()),
+        lambda f: usable(NpzReader(str(f / "a.npz"), cache_dir=str(f / "cache")).read()),
         ("a.npz",),
     ),
     **{

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.types.rays import Target
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.rays import RayBundle, Target
 
 
 class Loss(Part, ABC):
@@ -25,6 +26,16 @@ class Loss(Part, ABC):
 
     needs_weights: bool = False
     """Whether it looks at the weights and samples of renderings, which levels may leave out otherwise."""
+
+    def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
+        """Return the rays whose renderings it looks at, in place of those through a batch's pixels, and their target.
+
+        Args:
+            rays: through the pixels, as the model takes them.
+            target: what the photographs show there.
+            random: the step's numbers for these rays; None: nothing is drawn.
+        """
+        return rays, target
 
     @abstractmethod
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:

@@ -39,7 +39,9 @@ class ProposalLoss(Loss):
         """Return weighted means over rays: interlevel of each proposal, color and distortion of the last level."""
         last, weight = renderings[-1], target.weight
         none = torch.zeros_like(last.depth[0])
-        bounds = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
+        # Rays to known distances may have no color.
+        known = weight if target.certainty is None else weight.maximum(target.certainty)
+        bounds = [self.interlevel * (interlevel_loss(last, proposal) * known).mean() for proposal in renderings[:-1]]
         before = [none] * len(bounds)
         terms = {
             "interlevel": torch.stack([*bounds, none]),

@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.types.rays import Target
+from nerf_lightning.nerf.types.rays import RayBundle, Target
 
 LEAST_NEAR, LEAST_AROUND = 0.5, 0.6
 """Shares of good pixels from which on a pixel is kept for its neighbors' sake: in 3 x 3, and in the whole square."""
@@ -57,6 +58,10 @@ class RobustLoss(Loss):
 
     threshold: Tensor
     """Greatest residual of a pixel that is kept for itself."""
+
+    def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
+        """Return those of the other loss."""
+        return self.of.rays_to_render(rays, target, random)
 
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return what the other loss does for the rays that are kept; the others weigh 0."""

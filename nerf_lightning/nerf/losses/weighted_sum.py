@@ -6,7 +6,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.types.rays import Target
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.rays import RayBundle, Target
 
 
 class WeightedSum(Loss):
@@ -31,6 +32,13 @@ class WeightedSum(Loss):
         self.patch = max([1, *sides])
         self.depth_every = min((each.depth_every for each in terms.values() if each.depth_every), default=0)
         self.needs_weights = any(loss.needs_weights for loss in terms.values())
+
+    def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
+        """Return the rays that all losses look at, one loss after the other."""
+        for loss in self.terms.values():
+            if isinstance(loss, Loss):
+                rays, target = loss.rays_to_render(rays, target, random)
+        return rays, target
 
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return the terms of all losses, times their weights; several of one loss as `name_term`."""

@@ -118,7 +118,7 @@ SMALL = ("encoder.log2_table_size=10", "encoder.num_levels=3", "field.width=16")
 
 def a_model(model="fast_small", appearance=4):
     found = build(composed("train", f"model={model}", *SMALL, f"field.appearance={appearance}").model)
-    found.fit_to(ball_scene(num_views=8))
+    fit_parts(found, ball_scene(num_views=8))
     return found
 
 

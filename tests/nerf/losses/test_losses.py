@@ -12,8 +12,10 @@ from nerf_lightning.nerf.geometry.ndc import ndc_rays, share_at_distance, world_
 from nerf_lightning.nerf.losses.depth import DepthLoss, distance_error
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.proposal import ProposalLoss, distortion_loss, interlevel_loss, outer_weights
+from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.types.rays import PixelIndex, RaggedSamples, RayBundle, RaySamples, Target
@@ -105,6 +107,61 @@ def test_it_fades_as_the_run_goes_on():
     first = depth_of(loss, rendering, target)
     loss.on_step(StepContext(progress=0.5, step=50, key=0))
     assert depth_of(loss, rendering, target) == pytest.approx(0.1 * first)
+
+
+RANDOM = batch_random(5, 400, torch.device("cpu"))
+
+
+def rays_from_beside(loss, certainty, random=RANDOM, **changed):
+    rays = some_rays(400)
+    target = replace(target_of([3.0 + 0.01 * number for number in range(400)], [certainty] * 400), **changed)
+    return rays, target, *loss.rays_to_render(rays, target, random)
+
+
+@pytest.mark.parametrize("around", [lambda loss: loss, lambda loss: WeightedSum({"a": loss}), RobustLoss])
+def test_some_known_points_are_looked_at_from_beside_their_cameras(around):
+    rays, target, moved, there = rays_from_beside(around(DepthLoss(beside=0.25, reach=0.1)), 0.5)
+    aside = (moved.origins - rays.origins).norm(dim=-1)
+    assert 0.15 < float((aside > 0).float().mean()) < 0.35
+    torch.testing.assert_close(aside[aside == 0], (there.distance - target.distance)[aside == 0])
+    points, again = (r.origins + t.distance[:, None] * r.directions for r, t in ((rays, target), (moved, there)))
+    torch.testing.assert_close(again, points)
+    torch.testing.assert_close(moved.directions.norm(dim=-1), torch.ones(400))
+    torch.testing.assert_close(((moved.origins - rays.origins) * rays.directions).sum(dim=-1), torch.zeros(400))
+    assert 0.1 < float((aside / target.distance)[aside > 0].square().mean().sqrt()) < 0.2  # 0.1 along each of two axes
+    assert torch.equal(there.weight == 0, aside > 0)  # the photograph's color is not what is seen from there
+    # One in 8 rays of a batch knows a distance, of which a quarter have no color: the mean over the batch is 1.
+    torch.testing.assert_close(there.weight[aside == 0], torch.full_like(aside[aside == 0], 1 / (1 - 0.25 / 8)))
+
+
+def test_from_beside_only_what_is_half_transparent_before_the_point_is_wrong():
+    """A wall before the point may be there; fog that lets a third through is pulled at by that third."""
+    edges = torch.linspace(NEAR, FAR, SAMPLES + 1)
+    fog = (edges[:-1] < 3.0) * math.log(3.0) + 1e4 * (edges[:-1] >= 4.0)
+    rendering, target = seen(torch.stack([1e4 * (edges[:-1] >= 3.0), fog]).float()), target_of([4.0, 4.0])
+    plain = distance_error(rendering, target.distance, None)
+    found = [
+        DepthLoss(every=2)([rendering], replace(target, weight=torch.zeros(2), certainty=only))["depth"].sum()
+        for only in torch.eye(2)
+    ]
+    torch.testing.assert_close(torch.stack(found), plain * torch.tensor([0.0, 1 / 3]), atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("loss", "certainty", "changed"),
+    [
+        (DepthLoss(), 0.0, {}),
+        (DepthLoss(beside=0.0), 1.0, {}),
+        (DepthLoss(), 1.0, {"random": None}),
+        (DepthLoss(), 1.0, {"infinity": torch.full((400,), 9.0)}),
+        (DepthLoss(), 1.0, {"distance": None}),
+    ],
+)
+def test_rays_stay_where_no_point_is_known_and_in_normalised_device_coordinates(loss, certainty, changed):
+    rays, target, moved, there = rays_from_beside(loss, certainty, **changed)
+    assert torch.equal(moved.origins, rays.origins)
+    assert torch.equal(moved.directions, rays.directions)
+    assert there.distance is target.distance or torch.equal(there.distance, target.distance)
 
 
 def test_a_sum_says_how_many_rays_want_a_distance():
