@@ -33,8 +33,7 @@ def run(config: DictConfig) -> int:
     out = config.out or config.paths.output_dir
     written = _write(rows, notes, title, Path(str(out)), found.measured[0].protocol) if out else []
     print_rows(rows, title, "Widen it, or write all columns to files with out=DIR.")
-    if notes:
-        say(*notes)
+    say(*notes)
     say_written(*written)
     return len(rows)
 

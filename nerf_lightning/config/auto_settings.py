@@ -33,7 +33,7 @@ After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and
 
 RENDERED_PER_SECOND = 60_000
 """Rays that fast_proposal renders on two cores; so many for each second of half the budget are evaluated."""
-FEWEST_VIEWS = 3
+FEWEST_EVALUATED = 3
 
 LONGEST_SETTING, GPU_LONGEST = "scene.longest", 1600
 STEPS_SETTING = "model.levels.fine.sampler.num_steps"
@@ -121,19 +121,23 @@ def resolve_auto(
         begun = None if former is None else _number(former, "trainer.max_steps")
         config.trainer.max_steps = begun or config.trainer.published_steps
     if config.evaluation.max_views == AUTO:
-        begun = None if former is None else _number(former, "evaluation.max_views")
-        on_cpu = device_type == "cpu" and former is None
-        config.evaluation.max_views = begun or _views_for(scene, config, config.budget.seconds if on_cpu else None)
+        if former is not None:
+            config.evaluation.max_views = _number(former, "evaluation.max_views")
+        else:
+            config.evaluation.max_views = _views_for(scene, config) if device_type == "cpu" else None
     return config, chosen(choices)
 
 
-def _views_for(scene: Scene, config: DictConfig, seconds: int | float | None) -> int | None:
+def _views_for(scene: Scene, config: DictConfig) -> int | None:
     """Return how many held-out views a CPU evaluates within half the time that it trains, and say so; None: all."""
+    if config.budget.seconds is None or not config.final.evaluate:
+        return None
     views = list(scene.splits.get(config.evaluation.split, ()))
     pixels = scene.cameras.width[views].double() * scene.cameras.height[views].double()
-    if seconds is None or not config.final.evaluate or float(pixels.sum()) <= seconds / 2 * RENDERED_PER_SECOND:
+    affordable = config.budget.seconds / 2 * RENDERED_PER_SECOND
+    if float(pixels.sum()) <= affordable:
         return None
-    count = min(len(views), max(FEWEST_VIEWS, int(seconds / 2 * RENDERED_PER_SECOND / float(pixels.mean()))))
+    count = min(len(views), max(FEWEST_EVALUATED, int(affordable / float(pixels.mean()))))
     log.info(
         "evaluation: %d of %d %s views, because all take long (evaluation.max_views=null takes them)",
         count,

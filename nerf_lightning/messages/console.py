@@ -128,13 +128,13 @@ def label_lines(label: str) -> None:
 
 def say(*lines: str) -> None:
     """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
-    print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
+    if lines:
+        print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
 
 
 def say_written(*paths: Path) -> None:
     """Print where files are, a line each, as all commands do."""
-    if paths:
-        say(*(f"{'written':<12} {path}" for path in paths))
+    say(*(f"{'written':<12} {path}" for path in paths))
 
 
 class StdoutConsole(Console):

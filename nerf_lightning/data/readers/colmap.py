@@ -97,7 +97,7 @@ class ColmapReader(CaptureReader):
     def found_in(cls, folder: Path) -> str | None:
         """Return the model by which this format is known, where a folder has one."""
         found = models_in(folder)
-        return found[0].relative_to(folder).as_posix() if found else None
+        return next((model.relative_to(folder).as_posix() for model in found), None)
 
     def capture(self) -> Capture:
         """Return the registered photographs, in order of their names."""
@@ -154,13 +154,14 @@ class ColmapReader(CaptureReader):
                 f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in {places}, or in the folder "
                 "itself. Point scene.root at the folder above sparse/, or make a model with nerf poses images=DIR."
             )
-        if len(found) > 1:
+        first, *others = found
+        if others:
             log.info(
                 "%s is read, with %d photographs, of %d models; scene.model=FOLDER reads another (%s)",
-                *(found[0], _number_of_images(found[0]), len(found)),
-                listed((f"{path.relative_to(root)}: {_number_of_images(path)}" for path in found[1:]), 3),
+                *(first, found[first], len(found)),
+                listed((f"{model.relative_to(root)}: {found[model]}" for model in others), 3),
             )
-        return found[0]
+        return first
 
 
 def _view(image: ColmapImage, camera: ColmapCamera, path: Path) -> View:
@@ -218,8 +219,11 @@ def _require_known(camera: ColmapCamera, folder: Path) -> None:
     )
 
 
-def models_in(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture: most images first; of equal ones, the likeliest place."""
+def models_in(root: Path) -> dict[Path, int]:
+    """Return the folders of a capture's models and how many photographs each has, if there are several to choose from.
+
+    Those with most come first; of equal ones, the likeliest place.
+    """
     models = list[Path]()
     for place in MODEL_FOLDERS:
         folder = root / place
@@ -227,7 +231,8 @@ def models_in(root: Path) -> list[Path]:
         found = [path for path in (*below, folder) if any(os.path.lexists(path / f"cameras{e}") for e in KINDS)]
         found = [path for path in found if path not in models]
         models += found
-    return sorted(models, key=_number_of_images, reverse=True) if len(models) > 1 else models
+    counts = {model: _number_of_images(model) if len(models) > 1 else 0 for model in models}
+    return dict(sorted(counts.items(), key=lambda model: model[1], reverse=True))
 
 
 def _number_of_images(folder: Path) -> int:
