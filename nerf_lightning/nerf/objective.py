@@ -78,7 +78,7 @@ class Objective(Part):
             foreground=renderings[-1].foreground,
             rgb=shown[-1].rgb,
             target=target.rgb,
-            weight=batch.weight * (target.weight > 0),
+            weight=target.weight,
             pixels=batch.pixels,
         )
 

@@ -30,7 +30,7 @@ class StepOutput(TensorStruct):
     """The last level's colors, as they were compared with `target`."""
     target: Float[Tensor, "rays 3"]
     weight: Float[Tensor, "rays"]
-    """0 for masked pixels, and where the loss looks from elsewhere (`Loss.rays_to_render`)."""
+    """How much each color counted, on average 1; 0 for masked pixels, and from elsewhere (`Loss.rays_to_render`)."""
     pixels: PixelIndex
     gradient_norms: dict[str, Float[Tensor, ""]] = field(default_factory=dict)
     """By level, before clipping; empty where they were not measured or the step was not taken."""
