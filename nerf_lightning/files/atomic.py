@@ -37,7 +37,7 @@ def whole_file(path: Path, mode: int = 0o666) -> Iterator[Path]:
     removed.
     """
     make_folder(path.parent)
-    _sweep(path.parent)
+    remove_leftovers(path.parent)
     part = path.with_name(f".{path.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{path.suffix}")
     try:
         part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
@@ -109,7 +109,7 @@ def _is_at(handle: int, path: Path) -> bool:
 
 
 @cache
-def _sweep(folder: Path) -> None:
+def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files whose writers are dead, once in a process's life."""
     for part in folder.iterdir():
         if (name := PART.fullmatch(part.name)) and part.is_file():

@@ -100,14 +100,14 @@ def read_text(path: Path, kind: str, cure: str = CURE) -> str:
     return text
 
 
-def read_lines(file: io.BufferedReader, encoding: str) -> Iterator[str]:
+def read_lines(file: io.BufferedReader, encoding: str, errors: str = "strict") -> Iterator[str]:
     """Return the lines of a text one at a time, each no longer than `budgets.text_bytes`: a sparse file is one line.
 
     Raises:
         ValueError: a longer line, or no text.
     """
     most = limits().text_bytes
-    with io.TextIOWrapper(file, encoding, newline="\n") as lines:
+    with io.TextIOWrapper(file, encoding, errors, newline="\n") as lines:
         for number, line in enumerate(iter(lambda: lines.readline(most + 1), ""), start=1):
             if len(line) > most:
                 raise ValueError(f"line {number} has more than {most:,} characters")

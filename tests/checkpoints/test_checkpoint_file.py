@@ -4,12 +4,15 @@ import os
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
 from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
 
 def steps(folder):
@@ -28,6 +31,18 @@ def test_the_last_two_are_kept_also_where_files_cannot_be_linked(tmp_path, monke
     for step in (4, 5):
         write_checkpoint({"step": step}, tmp_path / "last.ckpt")
     assert steps(tmp_path) == {"best.ckpt": 30, "last.ckpt": 5, "previous.ckpt": 4}
+
+
+def test_what_a_killed_writer_left_goes_also_where_no_step_is_left(tmp_path):
+    trainer = Trainer(
+        default_root_dir=tmp_path, plugins=[AtomicCheckpointIO()], enable_checkpointing=False, logger=False
+    )
+    Checkpoints().setup(trainer, None, "fit")  # no folder yet
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / f".best.999999999_{MACHINE}.nerf_lightning.part.ckpt").write_text("half")
+    (tmp_path / "checkpoints" / "best.ckpt").write_text("whole")
+    Checkpoints().setup(trainer, None, "fit")
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["best.ckpt"]
 
 
 @pytest.mark.parametrize("function", ["fsync", "unlink", "link", "replace"])

@@ -36,7 +36,7 @@ def test_what_killed_processes_left_is_removed(tmp_path):
 def test_what_is_being_written_stays(tmp_path):
     with whole_file(tmp_path / "a.txt") as ours:
         ours.write_text("whole")
-        atomic._sweep.cache_clear()  # as another process
+        atomic.remove_leftovers.cache_clear()  # as another process
         with whole_file(tmp_path / "b.txt") as theirs:
             theirs.write_text("whole")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt", "b.txt"]
@@ -49,17 +49,17 @@ def test_a_file_that_is_made_and_not_yet_locked_is_not_lost(tmp_path, monkeypatc
 
     def sweep_first(handle, operation):
         monkeypatch.setattr(atomic.fcntl, "flock", flock)
-        atomic._sweep.cache_clear()
-        atomic._sweep(tmp_path)
+        atomic.remove_leftovers.cache_clear()
+        atomic.remove_leftovers(tmp_path)
         flock(handle, operation)
 
     (tmp_path / "a.txt").touch()
-    atomic._sweep(tmp_path)
+    atomic.remove_leftovers(tmp_path)
     monkeypatch.setattr(atomic.fcntl, "flock", sweep_first)
     with whole_file(tmp_path / "a.txt") as part:
         assert part.exists()
-        atomic._sweep.cache_clear()
-        atomic._sweep(tmp_path)
+        atomic.remove_leftovers.cache_clear()
+        atomic.remove_leftovers(tmp_path)
         part.write_text("whole")
     assert [file.read_text() for file in tmp_path.iterdir()] == ["whole"]
 

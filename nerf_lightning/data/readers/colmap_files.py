@@ -10,11 +10,9 @@ import mmap
 import os
 import struct
 from array import array
-from codecs import getincrementaldecoder
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
@@ -249,24 +247,21 @@ def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
     """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
     with open_regular(path, "colmap", CURE) as file:
         encoding = encoding_of(file)
-        if keep_empty and encoding == "utf-8-sig" and not _is_utf8(file):  # of photographs, which have names
-            encoding = WINDOWS
-            _say_of_encoding(path)
-        for number, line in enumerate(read_lines(file, encoding), start=1):
+        has_names = keep_empty and encoding == "utf-8-sig"
+        lines = read_lines(file, encoding, "surrogateescape" if has_names else "strict")
+        for number, line in enumerate(lines, start=1):
             if not line.startswith("#") and (keep_empty or line.strip()):
-                yield f"{path}, line {number}", line.strip()
+                yield f"{path}, line {number}", (line if line.isascii() else _with_names(line, path)).strip()
 
 
-def _is_utf8(file: BufferedReader) -> bool:
-    decoder = getincrementaldecoder("utf-8")()
+def _with_names(line: str, path: Path) -> str:
+    """Return a line that may have bytes which are no UTF-8: they are read as Windows writes names."""
     try:
-        while part := file.read(1 << 20):
-            decoder.decode(part)
-        return True
-    except UnicodeDecodeError:
-        return False
-    finally:
-        file.seek(0)
+        line.encode()
+        return line
+    except UnicodeEncodeError:
+        _say_of_encoding(path)
+        return line.encode(errors="surrogateescape").decode(WINDOWS)
 
 
 @cache

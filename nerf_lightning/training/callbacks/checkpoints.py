@@ -10,6 +10,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import BEST, LAST
+from nerf_lightning.files.atomic import remove_leftovers
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
@@ -33,12 +34,14 @@ class Checkpoints(Callback):
         self.best: float | None = None
 
     def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
-        """See that the trainer has who writes them.
+        """Check that the trainer has who writes them, and remove what killed processes left of theirs.
 
         Raises:
             InputError: it has not.
         """
         writer(trainer, self)
+        if self.folder(trainer).is_dir():  # a run that ends without a further step would leave them
+            remove_leftovers(self.folder(trainer))
 
     def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
         """Tell whether it is time for a checkpoint."""
