@@ -14,7 +14,6 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cones import pixel_side
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.kernels.rays import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
@@ -70,7 +69,7 @@ def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, 
 
 
 @disable_autocast
-@with_kernel(op.rays_through_pixels)
+@with_kernel("rays.cuda")
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
