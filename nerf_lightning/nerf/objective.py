@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.corrections.base import Correction, NoCorrection
+from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.models.base import Model
@@ -33,6 +33,8 @@ class Objective(Part):
         correction: what photographs make of the rendered colors; None leaves them alone.
     """
 
+    correction: Correction | None
+
     def __init__(
         self,
         model: Model,
@@ -42,8 +44,7 @@ class Objective(Part):
         correction: Correction | None = None,
     ):
         super().__init__()
-        self.model, self.rays = model, rays
-        self.correction = NoCorrection() if correction is None else correction
+        self.model, self.rays, self.correction = model, rays, correction
         self.loss, self.background = loss, background
 
     @property
@@ -66,7 +67,9 @@ class Objective(Part):
         target = self._target(batch, background, weight_scale)
         rays, target = self.loss.rays_to_render(self._rays(batch.pixels, batch.pixels.view), target, random)
         renderings = self._render(rays, background, random)
-        shown = [self.correction.photographed(rendering, batch.pixels) for rendering in renderings]
+        shown = renderings
+        if self.correction is not None:
+            shown = [self.correction.photographed(rendering, batch.pixels) for rendering in renderings]
         terms = self.loss(shown, target) | _penalties_of_levels(renderings)
         losses = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
         with torch.no_grad():

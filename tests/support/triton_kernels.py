@@ -251,7 +251,8 @@ def in_double(field, rays, samples, colored, whole_from):
     dense = isinstance(samples, RaySamples)
     output = field((points_along if dense else ragged_points)(*double, None))
     output = output if colored else replace(output, rgb=torch.zeros_like(output.rgb))
-    output = soften_near_gradients(output, double[1].midpoints, whole_from)
+    if whole_from:
+        output = soften_near_gradients(output, double[1].midpoints, whole_from)
     if not dense:
         return integrate_torch(output.density, output.rgb, double[1])
     weights = closed_weights(weights_from_density(output.density, double[1].deltas))

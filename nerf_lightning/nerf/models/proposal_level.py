@@ -55,7 +55,6 @@ class ProposalLevel(DenseLevel):
 
     def on_step(self, context: StepContext) -> None:
         """Decide whether the next step is one to learn in."""
-        super().on_step(context)
         self._learns = context.step < self.learn_always or context.step % self.learn_every == 0
 
     def forward(

@@ -131,5 +131,5 @@ class RaggedLevel(Level):
         """Let the sampler learn, where it is time, and average the samples per ray of the steps since."""
         if context.step % self.sampler.update_every and context.step != 1:
             return
-        super().on_step(context)
+        self.sampler.learn(self.field_density, context.step, context.key)
         self.counter.average()

@@ -12,7 +12,7 @@ from nerf_lightning.nerf.geometry.ndc import share_at_distance
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.refinements.base import NoRefinement, Refinement
+from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.refinements.displacements import align_untrained_cameras
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
@@ -36,6 +36,7 @@ class RayGenerator(Part):
             at photographs, and not at the very one that is asked for.
     """
 
+    refinement: Refinement | None
     near: Tensor
     far: Tensor
     capture_of: Tensor | None
@@ -50,7 +51,7 @@ class RayGenerator(Part):
         names_photographs: bool = False,
     ):
         super().__init__()
-        self.refinement = NoRefinement() if refinement is None else refinement
+        self.refinement = refinement
         self.lens_model = cameras.lens_model
         for name in MOVED:
             self.register_buffer(name, getattr(cameras, name), persistent=False)
@@ -80,7 +81,12 @@ class RayGenerator(Part):
     @property
     def cameras(self) -> Cameras:
         """The cameras that rays start from, as they have been learned so far."""
-        return self.refinement(self.given)
+        return self.given if self.refinement is None else self.refinement(self.given)
+
+    @property
+    def learns_cameras(self) -> bool:
+        """Whether anything is learned of them."""
+        return self.refinement is not None and self.refinement.moves()
 
     @property
     def given(self) -> Cameras:
@@ -116,7 +122,7 @@ class RayGenerator(Part):
         Args:
             trained: numbers of the views that are trained on.
         """
-        if not self.refinement.moves():
+        if not self.learns_cameras:
             return None
         with torch.no_grad():
             return align_untrained_cameras(self.given.to("cpu"), self.cameras.to("cpu"), trained)

@@ -100,7 +100,7 @@ class TileGradients:
             return seen.scaled((tile.stop - tile.start) / share.num_rays)
 
         together, threads = objective.together, 1 if self.points is None else threads_on(device)
-        learns_cameras = objective.rays.refinement.moves()
+        learns_cameras = objective.rays.learns_cameras
         if threads > 1 and not objective.model.takes_whole_rays(device, training=True, learns_cameras=learns_cameras):
             parts = list(tiles(batch.num_rays, num_pixels, together, multiple=threads))
             seen = parallel_backward(lose, parts, backward, list(objective.parameters()))
