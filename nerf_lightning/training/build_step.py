@@ -75,7 +75,7 @@ def build_step(
         start.load_weights(model)
     loss = build(config.loss) if loss is None else loss
     corrects, refines = not isinstance(correction, NoCorrection), refinement.moves()
-    rays = RayGenerator.of_views(scene, model, refinement if refines else None)
+    rays = RayGenerator.of_views(scene, model.needs_photographs, refinement if refines else None)
     return TrainStep(
         objective=Objective(model, rays, loss, scene.background, correction if corrects else None),
         optimizer=optimizer,

@@ -17,7 +17,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory
-from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.optimizers.groups import BuildOptimizer, optimizer_of
 from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, end_step, parts_of
@@ -25,10 +25,8 @@ from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.nerf.types.step_output import StepOutput
-from nerf_lightning.training.gradients.backward import Backward
 from nerf_lightning.training.gradients.recorded import RecordedGradients, Recorder, cuda_graph
-from nerf_lightning.training.gradients.tiles import Share, TileGradients, torch_backward
+from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 
 # The number of rays per step changes no more often.

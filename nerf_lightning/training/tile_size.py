@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.models.sample_counter import average_counts
+from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.photographs import photographs_of
-from nerf_lightning.nerf.models.subpixels import Subpixels
+from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs

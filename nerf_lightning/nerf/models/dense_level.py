@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.op import DENSE, has_dense_kernel, render_dense_rays, render_samples
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import DENSE, FieldParts, has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom

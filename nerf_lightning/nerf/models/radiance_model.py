@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.models.base import PointField
 from nerf_lightning.nerf.models.level import Level
-from nerf_lightning.nerf.models.subpixels import Subpixels
+from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle

@@ -1,7 +1,7 @@
 """Rays through pixels for CUDA, of pinholes and of radial and tangential lenses.
 
 One kernel does what `geometry.cameras.rays_through_pixels` does, with the iteration of `geometry.lenses` and the sides
-of pixels of `geometry.cones`. `TRITON_INTERPRET=1` runs it without a GPU.
+of pixels. `TRITON_INTERPRET=1` runs it without a GPU.
 """
 
 from typing import no_type_check
