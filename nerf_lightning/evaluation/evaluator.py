@@ -95,7 +95,7 @@ class Scoring:
             )
         shown_views = evenly_spaced_subset(views, self.num_pictures)
         show_photographs(model, scene)
-        rays_of = RayGenerator.of_views(scene, model)
+        rays_of = RayGenerator.of_views(scene, model.needs_photographs)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
         with closing(KeptViews(folder, self.split, self.num_worst)) as kept:

@@ -1,25 +1,72 @@
 """What training minimizes: pixels -> rays -> renderings -> what photographs show of them -> named terms of the loss."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.corrections.base import Correction, NoCorrection
+from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
+from nerf_lightning.nerf.models.ray_generator import RayGenerator, for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex, RayBundle, Target
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
-from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct, concatenate
+
+
+@dataclass(frozen=True)
+class StepOutput(TensorStruct):
+    """What a step saw of its rays, and what it lost there; detached. Callbacks find it as `outputs["step"]`.
+
+    Where steps are recorded and replayed, the next one writes over it: clone what is to be kept.
+    """
+
+    losses: Float[Tensor, "levels"]
+    """Of the whole batch, over all processes; their sum was minimized, with the penalties of parts."""
+    terms: dict[str, Float[Tensor, "levels"]]
+    """The same by term of the loss."""
+    color_errors: Float[Tensor, "levels"]
+    """Mean squared errors of the levels' colors, over all processes; a level without color has a meaningless one."""
+    foreground: Float[Tensor, "rays 3"]
+    """The last level's light, without the background's; of this process's rays, like all that follows."""
+    rgb: Float[Tensor, "rays 3"]
+    """The last level's colors, as they were compared with `target`."""
+    target: Float[Tensor, "rays 3"]
+    weight: Float[Tensor, "rays"]
+    """How much each color counted, on average 1; 0 for masked pixels, and from elsewhere (`Loss.rays_to_render`)."""
+    pixels: PixelIndex
+    gradient_norms: dict[str, Float[Tensor, ""]] = field(default_factory=dict)
+    """By level, before clipping; empty where they were not measured or the step was not taken."""
+
+    def scaled(self, share: float) -> "StepOutput":
+        """Return what a tile of rays, such a share of its batch, adds to the losses and errors of all of it."""
+        if share >= 1.0:
+            return self
+        terms = {name: levels * share for name, levels in self.terms.items()}
+        return replace(self, losses=self.losses * share, terms=terms, color_errors=self.color_errors * share)
+
+    @classmethod
+    def joined(cls, tiles: Sequence["StepOutput"]) -> "StepOutput":
+        """Return what tiles add up to, their rays one after the other."""
+        if len(tiles) == 1:
+            return tiles[0]
+        return cls(
+            losses=torch.stack([each.losses for each in tiles]).sum(0),
+            terms={name: torch.stack([each.terms[name] for each in tiles]).sum(0) for name in tiles[0].terms},
+            color_errors=torch.stack([each.color_errors for each in tiles]).sum(0),
+            foreground=torch.cat([each.foreground for each in tiles]),
+            rgb=torch.cat([each.rgb for each in tiles]),
+            target=torch.cat([each.target for each in tiles]),
+            weight=torch.cat([each.weight for each in tiles]),
+            pixels=concatenate([each.pixels for each in tiles]),
+        )
 
 
 class Objective(Part):
@@ -33,6 +80,8 @@ class Objective(Part):
         correction: what photographs make of the rendered colors; None leaves them alone.
     """
 
+    correction: Correction | None
+
     def __init__(
         self,
         model: Model,
@@ -42,8 +91,7 @@ class Objective(Part):
         correction: Correction | None = None,
     ):
         super().__init__()
-        self.model, self.rays = model, rays
-        self.correction = NoCorrection() if correction is None else correction
+        self.model, self.rays, self.correction = model, rays, correction
         self.loss, self.background = loss, background
 
     @property
@@ -66,7 +114,9 @@ class Objective(Part):
         target = self._target(batch, background, weight_scale)
         rays, target = self.loss.rays_to_render(self._rays(batch.pixels, batch.pixels.view), target, random)
         renderings = self._render(rays, background, random)
-        shown = [self.correction.photographed(rendering, batch.pixels) for rendering in renderings]
+        shown = renderings
+        if self.correction is not None:
+            shown = [self.correction.photographed(rendering, batch.pixels) for rendering in renderings]
         terms = self.loss(shown, target) | _penalties_of_levels(renderings)
         losses = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
         with torch.no_grad():

@@ -48,6 +48,17 @@ class Part(nn.Module):
     def on_step(self, context: StepContext) -> None:
         """Prepare for the next step of training; the parts within have done so."""
 
+    def after_step(
+        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
+    ) -> None:
+        """Learn from what a step has seen, once it is taken; state that the next steps depend on is kept in buffers.
+
+        Args:
+            rgb: the last level's picture.
+            target: what the photographs show.
+            weight: 0 for masked pixels.
+        """
+
     def penalty(self) -> Float[Tensor, ""] | None:
         """Return what is added to the loss of each step, once, however the step is cut; None: nothing."""
         return None
@@ -112,6 +123,14 @@ def begin_step(module: nn.Module, context: StepContext) -> None:
     """Let every part within a module prepare for a step, inner parts first: a level's grid asks its field."""
     for part in reversed(list(parts_of(module))):
         part.on_step(context)
+
+
+def end_step(
+    module: nn.Module, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
+) -> None:
+    """Let every part within a module learn from what a step has seen."""
+    for part in parts_of(module):
+        part.after_step(rgb, target, weight)
 
 
 def sample_counts(module: nn.Module) -> list[Tensor]:

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.random import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
@@ -68,7 +67,7 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
-        return _uniform(self.key, self.slots, purpose_word(purpose), count)
+        return uniform(self.key, self.slots, purpose_word(purpose), count)
 
     def normal(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` standard normal numbers per ray."""
@@ -107,10 +106,11 @@ def _hashed(key: Tensor, slots: Tensor, number: Tensor, word: int) -> Tensor:
     return (words >> 8).to(torch.float32) * 2.0**-24
 
 
-@with_kernel(op.uniform)
-def _uniform(
+@with_kernel("random.cpu", "random.cuda")
+def uniform(
     key: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], word: int, count: int
 ) -> Float[Tensor, "*rays {count}"]:
+    """Return `count` numbers per ray, uniform on [0, 1), given the word of a purpose."""
     number = torch.arange(count, device=slots.device).expand(*slots.shape, count)
     return _hashed(key[..., None], slots[..., None], number, word)
 
@@ -123,7 +123,7 @@ def batch_random(
     return RayRandom(key=key.expand_as(slots) if isinstance(key, Tensor) else torch.full_like(slots, key), slots=slots)
 
 
-@with_kernel(op.permute)
+@with_kernel("random.cpu")
 def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:
     """Return where a keyed permutation of range(size) sends each index; nothing is stored, any size is allowed.
 

@@ -68,7 +68,7 @@ class TrainedModel:
                 shot = shot_of(Subject(self.module, scene, behind), replace(one.to("cpu"), c2w=c2w), self.tile_points)
                 picture = shot.picture(0)
             else:
-                rays_of = RayGenerator.of_views(scene, self.module)
+                rays_of = RayGenerator.of_views(scene, self.module.needs_photographs)
                 picture = render_picture(self.module, rays_of, self._view(camera), behind, self.tile_points)
             return replace(picture, depth=unit_of(scene.to_user) * picture.depth)
 

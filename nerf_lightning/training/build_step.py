@@ -9,7 +9,7 @@ from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import hold_to_budgets
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.corrections.base import Correction, NoCorrection
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model, show_photographs
@@ -74,9 +74,10 @@ def build_step(
     if start is not None:
         start.load_weights(model)
     loss = build(config.loss) if loss is None else loss
-    rays = RayGenerator.of_views(scene, model, refinement)
+    corrects, refines = not isinstance(correction, NoCorrection), refinement.moves()
+    rays = RayGenerator.of_views(scene, model.needs_photographs, refinement if refines else None)
     return TrainStep(
-        objective=Objective(model, rays, loss, scene.background, correction),
+        objective=Objective(model, rays, loss, scene.background, correction if corrects else None),
         optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,

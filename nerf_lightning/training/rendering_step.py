@@ -31,7 +31,9 @@ def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Train
     scene, model, settings = checkpoint.scene, load_model(checkpoint, trusted), ComputeSettings(accelerator="cpu")
     settings.keep_tile(checkpoint.tile_points)
     return TrainStep(
-        objective=Objective(model, RayGenerator.of_views(scene, model), MeanSquaredError(), scene.background),
+        objective=Objective(
+            model, RayGenerator.of_views(scene, model.needs_photographs), MeanSquaredError(), scene.background
+        ),
         optimizer=no_optimizer,
         schedule=ExponentialDecay(),
         progress=Progress(),

@@ -6,7 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 
 from nerf_lightning.compute import ranks
@@ -15,18 +17,16 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory
-from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.optimizers.groups import BuildOptimizer, optimizer_of
 from nerf_lightning.nerf.optimizers.schedule import Schedule
-from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, parts_of
+from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, end_step, parts_of
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.nerf.types.step_output import StepOutput
-from nerf_lightning.training.gradients.backward import Backward
 from nerf_lightning.training.gradients.recorded import RecordedGradients, Recorder, cuda_graph
-from nerf_lightning.training.gradients.tiles import Share, TileGradients, torch_backward
+from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 
 # The number of rays per step changes no more often.
@@ -117,9 +117,10 @@ class TrainStep:
             guarded = self.recorded is not None and self.recorded.guards
             if guarded or self.guard.allows(seen.losses, self.objective.named_weights()):
                 if measure_gradients:
-                    seen = replace(seen, gradient_norms=self.model.gradient_norms())
+                    norms = {name: _norm_of_gradients(part) for name, part in self.model.rounds().items()}
+                    seen = replace(seen, gradient_norms=norms)
                 self._update(optimizer)
-                self.objective.loss.learn(seen.rgb, seen.target, seen.weight)
+                end_step(self.objective, seen.rgb, seen.target, seen.weight)
                 ranks.average(buffers_to_average(self.objective.loss))
             self._advance(share.num_rays)
             return seen
@@ -269,3 +270,7 @@ class TrainStep:
         """Return this process's part of the batch, given the sum of the weights of all of it."""
         num_rays, together = self.progress.batch_rays, self.objective.together
         return Share(ranks.share(num_rays // together).start * together, num_rays, weight)
+
+
+def _norm_of_gradients(module: nn.Module) -> Float[Tensor, ""]:
+    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])

@@ -16,10 +16,10 @@ from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run

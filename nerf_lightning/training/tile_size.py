@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.models.sample_counter import average_counts
+from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -32,7 +32,7 @@ def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatche
     By training steps that are thrown away; a few seconds at most. None: the tile is known without.
     """
     step.to(settings.device)
-    if step.model.takes_whole_rays(step.device, training=True, learns_cameras=step.rays.refinement.moves()):
+    if step.model.takes_whole_rays(step.device, training=True, learns_cameras=step.rays.learns_cameras):
         return WHOLE_RAYS_TILE, None
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = _rays_in_time(settings, step, batch)

@@ -36,7 +36,7 @@ from nerf_lightning.config.instantiate import build; from nerf_lightning.trainin
 from nerf_lightning.commands.train_job.memory_plan import memory_plan
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.evaluation.metrics import image_metrics
-from nerf_lightning.nerf.models.sample_counter import average_counts
+from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.models.render_image import render_picture
 
 TILE = int(sys.argv[3])

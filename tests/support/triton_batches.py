@@ -54,12 +54,13 @@ def check_rays(kernels, device, generator, rays):
             pixels = PixelIndex(view, x, y)
             expected = rays_through_pixels(double, pixels, near, 2 * near, None, 2)
             given = (each.to(device) for each in (cameras, pixels, near, 2 * near))
-            found = kernels.rays_through_pixels(*given, 2)
+            found = kernels.rays_through_pixels(*given, None, 2)
             for one, other in zip(found.tensors(), expected.tensors(), strict=True):
                 torch.testing.assert_close(one.cpu().double(), other.double(), rtol=2e-6, atol=1e-6)
     for wants in (cameras.c2w, cameras.lens):
-        assert kernels.takes(cameras)
-        assert not kernels.takes(double)
+        given = pixels, near, 2 * near
+        assert kernels.rays_through_pixels(cameras, *given) is not None
+        assert kernels.rays_through_pixels(double, *given) is None
         wants.requires_grad_()
-        assert not kernels.takes(cameras)
+        assert kernels.rays_through_pixels(cameras, *given) is None
         wants.requires_grad_(False)

@@ -165,7 +165,7 @@ def check_histograms(kernels, device, generator, rays):
         weights[0] = 0.0
         u = torch.rand(rays, count, generator=generator).sort(dim=-1).values.to(device)
         u[:, -1] = 1.0 - 2.0**-24
-        found = kernels.sample(edges, weights, u, 0.01, contracted)
+        found = kernels.sample_histogram(edges, weights, u, 0.01, contracted)
         expected = sample_histogram(edges.double(), weights.double(), u.double(), 0.01, contracted)
         torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
         found[:, 1] = edges[:, 1]  # edges that are equal
@@ -175,16 +175,18 @@ def check_histograms(kernels, device, generator, rays):
         for moved in (None, jitter):
             given = torch.linspace(0, 1, count, device=device), moved, *ends
             expected = stratified_edges(*(None if each is None else each.double() for each in given), contracted)
-            torch.testing.assert_close(kernels.stratified(*given, contracted).double(), expected, rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(
+                kernels.stratified_edges(*given, contracted).double(), expected, rtol=1e-4, atol=1e-6
+            )
 
 
 def _check_losses(kernels, outer, v, inner, contracted, generator):
     w = torch.rand(*inner.diff(dim=-1).shape, generator=generator).to(outer.device) / 4
     for loss, leaf, found in (
-        (lambda v: interlevel_loss(rendering(inner, w), rendering(outer, v)), v, lambda v: kernels.interlevel(
-            inner, w, outer, v)),
-        (lambda w: distortion_loss(rendering(inner, w, contracted)), w, lambda w: kernels.distortion(
-            inner, w, contracted)),
+        (lambda v: interlevel_loss(rendering(inner, w), rendering(outer, v)), v, lambda v: kernels.interlevel_loss(
+            rendering(inner, w), rendering(outer, v))),
+        (lambda w: distortion_loss(rendering(inner, w, contracted)), w, lambda w: kernels.distortion_loss(
+            rendering(inner, w, contracted))),
     ):  # fmt: skip
         single, double = leaf.clone().requires_grad_(), leaf.double().requires_grad_()
         expected, values = loss(double), found(single)
@@ -249,7 +251,8 @@ def in_double(field, rays, samples, colored, whole_from):
     dense = isinstance(samples, RaySamples)
     output = field((points_along if dense else ragged_points)(*double, None))
     output = output if colored else replace(output, rgb=torch.zeros_like(output.rgb))
-    output = soften_near_gradients(output, double[1].midpoints, whole_from)
+    if whole_from:
+        output = soften_near_gradients(output, double[1].midpoints, whole_from)
     if not dense:
         return integrate_torch(output.density, output.rgb, double[1])
     weights = closed_weights(weights_from_density(output.density, double[1].deltas))

@@ -17,9 +17,9 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.gradients.recorded import cuda_graph
 from nerf_lightning.training.launch.trainer import TrainerSettings
 

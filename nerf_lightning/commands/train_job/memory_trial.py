@@ -21,8 +21,8 @@ from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.models.render_image import Picture
-from nerf_lightning.nerf.models.sample_counter import average_counts
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS

@@ -28,7 +28,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     optimizer.zero_grad()
     whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
-    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=step.rays.refinement.moves()):
+    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=step.rays.learns_cameras):
         return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
         points = ragged_points(rays, sampler(rays, None), None)

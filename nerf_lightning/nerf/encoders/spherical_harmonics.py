@@ -5,7 +5,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.kernels.spherical_harmonics import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 
 # Normalized so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
@@ -41,7 +40,7 @@ class SphericalHarmonicsEncoder(Encoder):
         """Nothing is learned here."""
 
 
-@with_kernel(op.spherical_harmonics)
+@with_kernel("spherical_harmonics.cuda")
 def spherical_harmonics(points: Float[Tensor, "*points 3"], degree: int) -> Float[Tensor, "*points features"]:
     """Return Y_00, Y_1-1, Y_10, Y_11, Y_2-2, ... of unit directions."""
     x, y, z = points.movedim(-1, 0).contiguous()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.types.points import Points

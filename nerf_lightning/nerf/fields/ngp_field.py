@@ -16,7 +16,7 @@ from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_
 from nerf_lightning.nerf.geometry.cones import contracted_covariance, scaled_covariance
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.op import mlp
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.matmul_precision import linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points

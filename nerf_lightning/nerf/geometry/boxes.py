@@ -5,7 +5,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
-from nerf_lightning.nerf.kernels.march import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.rays import RayBundle
 
@@ -40,7 +39,7 @@ def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Flo
     return aabb.mean(dim=0), 0.5 * (aabb[1] - aabb[0])
 
 
-@with_kernel(op.distances_in_box)
+@with_kernel("march.cuda")
 def distances_in_box(
     rays: RayBundle, aabb: Float[Tensor, "2 3"]
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:

@@ -11,10 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cones import pixel_side
-from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
+from nerf_lightning.nerf.geometry.lenses import project_plane, stretches, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.kernels.rays import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
@@ -70,7 +68,7 @@ def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, 
 
 
 @disable_autocast
-@with_kernel(op.rays_through_pixels)
+@with_kernel("rays.cuda")
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
@@ -108,6 +106,34 @@ def rays_through_pixels(
     side = pixel_side(cameras, view, _turned(local)) / per_side
     rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions, pixel_side=side)
     return rays if cameras.ndc is None else ndc_rays(rays, cameras.ndc[view])
+
+
+@torch.no_grad()
+def pixel_side(
+    cameras: Cameras, view: Int[Tensor, "*rays"], directions: Float[Tensor, "*rays 3"]
+) -> Float[Tensor, "*rays 2"]:
+    """Return the side of pixels at distance 0, and by how much it grows per unit of distance: the root of their areas.
+
+    A pinhole's pixel takes the solid angle cos^3 / (f_x f_y); a lens that stretches its surroundings shows less in it.
+    In normalized device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
+    Without gradients: the size of its pixels is no reason to move a camera.
+
+    Args:
+        cameras: all views.
+        view: of each pixel.
+        directions: of the pixels' centers in the lens's axes (right, down, forward), of any length.
+    """
+    pixel = 1.0 / cameras.focal[view]
+    if cameras.ndc is not None:
+        side = (cameras.ndc[view] * pixel).prod(dim=-1).sqrt()
+        return torch.stack([side, torch.zeros_like(side)], dim=-1)
+    area = pixel.prod(dim=-1)
+    if cameras.lens_model != "pinhole":
+        area = area / stretches(directions, cameras.lens[view], cameras.lens_model).prod(dim=-1)
+    if cameras.lens_model in ("pinhole", "radial_tangential"):
+        area = area * (directions[..., 2] / directions.norm(dim=-1)) ** 3
+    side = area.clamp(min=0.0).sqrt()
+    return torch.stack([torch.zeros_like(side), side], dim=-1)
 
 
 def all_pixels(cameras: Cameras, view: int) -> PixelIndex:

@@ -5,44 +5,14 @@ across. A covariance is kept as its six entries xx, yy, zz, xy, xz, yz.
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.lenses import stretches
 from nerf_lightning.nerf.matmul_precision import disable_autocast
-from nerf_lightning.nerf.types.scene import Cameras
 
 ROWS, COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 UNIFORM_VARIANCE = 1.0 / 12.0
 """Of a uniform distribution over a unit of length."""
-
-
-@torch.no_grad()
-def pixel_side(
-    cameras: Cameras, view: Int[Tensor, "*rays"], directions: Float[Tensor, "*rays 3"]
-) -> Float[Tensor, "*rays 2"]:
-    """Return the side of pixels at distance 0, and by how much it grows per unit of distance: the root of their areas.
-
-    A pinhole's pixel takes the solid angle cos^3 / (f_x f_y); a lens that stretches its surroundings shows less in it.
-    In normalized device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
-    Without gradients: the size of its pixels is no reason to move a camera.
-
-    Args:
-        cameras: all views.
-        view: of each pixel.
-        directions: of the pixels' centers in the lens's axes (right, down, forward), of any length.
-    """
-    pixel = 1.0 / cameras.focal[view]
-    if cameras.ndc is not None:
-        side = (cameras.ndc[view] * pixel).prod(dim=-1).sqrt()
-        return torch.stack([side, torch.zeros_like(side)], dim=-1)
-    area = pixel.prod(dim=-1)
-    if cameras.lens_model != "pinhole":
-        area = area / stretches(directions, cameras.lens[view], cameras.lens_model).prod(dim=-1)
-    if cameras.lens_model in ("pinhole", "radial_tangential"):
-        area = area * (directions[..., 2] / directions.norm(dim=-1)) ** 3
-    side = area.clamp(min=0.0).sqrt()
-    return torch.stack([torch.zeros_like(side), side], dim=-1)
 
 
 def cone_covariance(

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.panoramas import panorama_stretches, project_panorama, unproject_panorama
-from nerf_lightning.nerf.kernels.lenses import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.scene import LensModel
 
@@ -65,7 +64,7 @@ def unproject(
         radius = _length(plane)
         return at_angle(_angle_at(radius, lens), plane / radius[..., None])
     if model == "radial_tangential":
-        plane = _undistorted(plane, lens, NEWTON_STEPS)
+        plane = undistort(plane, lens, NEWTON_STEPS)
     return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
 
 
@@ -130,8 +129,11 @@ def _distorted(plane: Tensor, lens: Tensor) -> tuple[Tensor, tuple[Tensor, Tenso
     return torch.stack([bent_x, bent_y], dim=-1), (along_x, across, along_y)
 
 
-@with_kernel(op.undistort)
-def _undistorted(plane: Tensor, lens: Tensor, newton_steps: int) -> Tensor:
+@with_kernel("lenses.cpu")
+def undistort(
+    plane: Float[Tensor, "*points 2"], lens: Float[Tensor, "*#points 6"], newton_steps: int
+) -> Float[Tensor, "*points 2"]:
+    """Return where a radial and tangential lens takes its places in the plane from."""
     # Newton's iteration in two dimensions. From the distorted point on it cannot overshoot a lens that bends one way
     # only (barrel: from below a concave function; pincushion: from above a convex one).
     found = plane

@@ -2,33 +2,48 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def with_kernel(
-    kernel: Callable[Arguments, Result | None],
-) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Let a function return what a kernel does, and compute only where that returns None.
+def with_kernel(*modules: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Let a function return what a kernel does on the device of its first argument, and compute only where none does.
 
     Args:
-        kernel: takes the same arguments, and knows for which of them there is a kernel (`op.py` of its folder).
+        modules: of `nerf.kernels`, such as `random.cpu`. Each has a function of the same name and arguments, which
+            returns None where it does not take what it is given.
 
-    >>> @with_kernel(lambda x: 2 * x if x < 10 else None)
-    ... def double(x):
-    ...     return x + x + 0.0
-    >>> double(3), double(30)
-    (6, 60.0)
+    >>> @with_kernel("random.cpu")
+    ... def uniform(key, slots, word, count):
+    ...     return "in plain torch"
+    >>> one = torch.ones(1, dtype=torch.int64)
+    >>> uniform(one, one, 1, 2).shape, uniform(one.view(1, 1), one.view(1, 1), 1, 2)
+    (torch.Size([1, 2]), 'in plain torch')
     """
 
     def decorate(reference: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         @wraps(reference)
         def either(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            found = kernel(*args, **kwargs)
-            return reference(*args, **kwargs) if found is None else found
+            first: Any = args[0]
+            for module in modules:
+                kernels = (cpu_backend if module.endswith(".cpu") else cuda_backend)(module, first.device)
+                found = None if kernels is None else getattr(kernels, reference.__name__)(*args, **kwargs)
+                if found is not None:
+                    return found
+            return reference(*args, **kwargs)
 
         return either
 
     return decorate
+
+
+def are_rows(*tensors: Tensor) -> bool:
+    """Return whether tensors are float32, with a row for each ray: what kernels take."""
+    return all(each.dim() == 2 and each.dtype == torch.float32 for each in tensors)

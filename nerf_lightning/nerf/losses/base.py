@@ -45,14 +45,3 @@ class Loss(Part, ABC):
             renderings: one per level.
             target: what the photographs show, how much each ray counts, and where in which photograph it lies.
         """
-
-    def learn(
-        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
-    ) -> None:
-        """Learn from what a step has seen, once it is taken; state that the next steps depend on is kept in buffers.
-
-        Args:
-            rgb: the last level's picture.
-            target: what the photographs show.
-            weight: 0 for masked pixels.
-        """

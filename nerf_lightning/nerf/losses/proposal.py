@@ -3,15 +3,13 @@
 Letters: edges t, weights w of the last level; edges u, weights v of a proposal.
 """
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
-from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.kernels.search import search
+from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_errors
 from nerf_lightning.nerf.types.rays import Target
@@ -53,6 +51,7 @@ class ProposalLoss(Loss):
         return terms
 
 
+@with_kernel("histograms.cpu", "histograms.cuda")
 def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"]:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray (Eq. 13).
 
@@ -60,9 +59,6 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
     much, but what the last level sees must lie within it. Only the proposal receives gradients.
     """
     weights, edges = last.weights.detach(), last.samples.edges.detach()
-    kernels = _kernels_for(weights, proposal.weights)
-    if kernels is not None:
-        return kernels.interlevel(edges, weights, proposal.samples.edges, proposal.weights)
     bound = outer_weights(edges, proposal.samples.edges.detach(), proposal.weights)
     excess = (weights - bound).clamp(min=0.0)
     return (excess.square() / (weights + 1e-7)).sum(dim=-1)
@@ -83,6 +79,7 @@ def outer_weights(
     return total.gather(-1, last.clamp(0, bins)) - total.gather(-1, first.clamp(0, bins))
 
 
+@with_kernel("histograms.cpu", "histograms.cuda")
 def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray (Eq. 15).
 
@@ -91,9 +88,6 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     2 sum_i w_i (m_i sum_{j<i} w_j - sum_{j<i} w_j m_j).
     """
     edges, w = rendering.samples.edges, rendering.weights
-    kernels = _kernels_for(w)
-    if kernels is not None and not edges.requires_grad:
-        return kernels.distortion(edges, w, rendering.samples.contracted_spacing)
     if rendering.samples.contracted_spacing:
         edges = normalized_distance(edges)
     span = (edges[..., -1:] - edges[..., :1]).clamp(min=1e-6)
@@ -102,9 +96,3 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     pairs = 2.0 * (w * (m * before - moment)).sum(dim=-1)
     own = (w.square() * edges.diff(dim=-1) / span).sum(dim=-1) / 3.0
     return pairs + own
-
-
-def _kernels_for(*weights: Tensor) -> Any:
-    # Everything else takes the plain way, which is the reference.
-    suits = all(each.dim() == 2 and each.dtype == torch.float32 for each in weights)
-    return backend_for("histograms", weights[0].device) if suits else None

@@ -71,7 +71,7 @@ class RobustLoss(Loss):
         return self.of(renderings, replace(target, weight=target.weight * kept))
 
     @torch.no_grad()
-    def learn(
+    def after_step(
         self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
     ) -> None:
         """Move the threshold toward that of a step's residuals; masked pixels have none."""

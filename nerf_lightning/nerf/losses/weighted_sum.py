@@ -48,11 +48,3 @@ class WeightedSum(Loss):
             for term, values in terms.items():
                 found[name if len(terms) == 1 else f"{name}_{term}"] = self.weights.get(name, 1.0) * values
         return found
-
-    def learn(
-        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
-    ) -> None:
-        """Let each loss learn."""
-        for loss in self.terms.values():
-            if isinstance(loss, Loss):
-                loss.learn(rgb, target, weight)

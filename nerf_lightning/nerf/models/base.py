@@ -7,11 +7,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.photographs import photographs_of
-from nerf_lightning.nerf.models.subpixels import Subpixels
+from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
@@ -83,9 +82,9 @@ class Model(Part, ABC):
         They are no part of the model's state: no checkpoint carries them.
         """
 
-    def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
-        """Return the Euclidean norms of gradients, by round."""
-        return {self.level_names[-1]: norm_of_gradients(self)}
+    def rounds(self) -> dict[str, nn.Module]:
+        """Return what learns in each round, by name: the norms of its gradients are logged."""
+        return {self.level_names[-1]: self}
 
     def kernels(self) -> tuple[str, ...]:
         """Return the modules of `nerf.kernels` that training takes on a CPU, to be compiled ahead of the first step."""
@@ -120,11 +119,6 @@ def point_field(model: Model) -> PointField:
         f"{type(model).__name__} renders rays and has neither density nor color at points, so neither surfaces nor "
         "volumes can be exported. nerf render films it; for the others train a model of the scene, such as model=fast."
     )
-
-
-def norm_of_gradients(module: nn.Module) -> Float[Tensor, ""]:
-    """Return the Euclidean norm of all gradients of a module."""
-    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])
 
 
 def _look_at_what_was_loaded(model: Model, _: Any) -> None:

@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.op import DENSE, has_dense_kernel, render_dense_rays, render_samples
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import DENSE, FieldParts, has_dense_kernel, render_dense_rays, render_samples
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -15,7 +14,7 @@ from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -72,19 +71,33 @@ class DenseLevel(Level):
         """
         samples = self.sampler(rays, history, random)
         whole_from = 0.0 if random is None else self.gradient_scaling_distance
+        rendering = self._by_kernels(rays, samples, background, whole_from)
+        if rendering is not None:
+            return rendering
+        seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
+        if whole_from:
+            seen = soften_near_gradients(seen, samples.midpoints, whole_from)
+        return composite(seen, samples, rays, background)
+
+    def _by_kernels(
+        self, rays: RayBundle, samples: RaySamples, background: Float[Tensor, "rays 3"] | None, whole_from: float
+    ) -> DenseRendering | None:
+        """Return what kernels see in samples; None where there are none for the field, or not all that is asked for."""
         plain = rays.near.dim() != 1 or rays.near.dtype != torch.float32
         parts = None if plain else self._parts_on(rays.near.device)
-        integrated = render_samples(rays, samples, parts, self.field.matmul_precision, background is None, whole_from)
-        if integrated is not None:
-            *sums, weights = integrated
-            return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
-        if parts is not None and rays.near.device.type == "cpu":
+        if parts is None:
+            return None
+        precision, closed = self.field.matmul_precision, background is None
+        if rays.near.device.type == "cpu":
             weights, foreground = render_dense_rays(
-                rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from, OPAQUE_BELOW
+                rays, samples.edges, parts, precision, closed, whole_from, OPAQUE_BELOW
             )
             return rendering_of(weights, foreground, samples, rays, background)
-        seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
-        return composite(soften_near_gradients(seen, samples.midpoints, whole_from), samples, rays, background)
+        integrated = render_samples(rays, samples, parts, precision, closed, whole_from)
+        if integrated is None:
+            return None
+        *sums, weights = integrated
+        return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether there is a kernel for the field; it has gradients of rays, too."""
@@ -101,9 +114,9 @@ class DenseLevel(Level):
         """Return the field's parts where there is a kernel for them."""
         # Elsewhere reading them would wait for the device.
         parts = self.field_parts() if device.type in ("cpu", "cuda") else None
-        if device.type == "cpu" and not has_dense_kernel(parts, self.field.matmul_precision, device):
-            return None
-        return parts
+        if parts is None or device.type == "cuda":
+            return parts
+        return parts if has_dense_kernel(parts, self.field.matmul_precision, device) else None
 
     def field_output(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""

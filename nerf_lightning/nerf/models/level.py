@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.part import Part, StepContext
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -80,7 +80,3 @@ class Level(Part):
     def compile_field(self) -> bool:
         """Compile the field where its shapes do not depend on the data; tell whether it was."""
         return False
-
-    def on_step(self, context: StepContext) -> None:
-        """Let the sampler learn from the field."""
-        self.sampler.learn(self.field_density, context.step, context.key)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.march.reference import occupied_intervals
 from nerf_lightning.nerf.models.level import Level
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.sample_points import points_along
@@ -26,6 +27,10 @@ class MaskedLevel(Level):
     sampler: OccupancySampler
     sampler_kind = OccupancySampler
     replays = False
+
+    def on_step(self, context: StepContext) -> None:
+        """Let the sampler learn from the field."""
+        self.sampler.learn(self.field_density, context.step, context.key)
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """All intervals of the lattice."""

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
@@ -55,7 +55,6 @@ class ProposalLevel(DenseLevel):
 
     def on_step(self, context: StepContext) -> None:
         """Decide whether the next step is one to learn in."""
-        super().on_step(context)
         self._learns = context.step < self.learn_always or context.step % self.learn_every == 0
 
     def forward(

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.geometry.contraction import Contracted
-from nerf_lightning.nerf.models.base import PointField, norm_of_gradients
+from nerf_lightning.nerf.models.base import PointField
 from nerf_lightning.nerf.models.level import Level
-from nerf_lightning.nerf.models.subpixels import Subpixels
+from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -103,9 +103,9 @@ class RadianceModel(PointField):
                 module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
-    def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
-        """Return the Euclidean norm of the gradients of each level."""
-        return {name: norm_of_gradients(level) for name, level in zip(self.levels, self._in_order(), strict=True)}
+    def rounds(self) -> dict[str, nn.Module]:
+        """Return the levels."""
+        return dict(self.levels.items())
 
     def _in_order(self) -> list[Level]:
         return cast(list[Level], list(self.levels.values()))

@@ -1,22 +1,25 @@
 """A level whose samples are packed: only where its sampler says that there may be something is anything computed."""
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from threading import Lock
+from typing import Any
 
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.render.op import (
     LEARNING,
     RENDERING,
+    FieldParts,
     has_kernel,
     render_samples,
     render_whole_rays,
     takes_samples,
 )
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.models.level import Level
-from nerf_lightning.nerf.models.sample_counter import SampleCounter
-from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.part import Part, StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
@@ -27,6 +30,10 @@ from nerf_lightning.nerf.types.renderings import RaggedRendering, Rendering
 
 MOST_SAMPLES = 1 << 22
 """That are rendered at once: their features take a gigabyte and a half."""
+MOST_PER_RAY = 1 << 12
+"""That can have been counted."""
+# Threads may take tiles of one step side by side.
+COUNTING = Lock()
 
 
 class RaggedLevel(Level):
@@ -131,5 +138,83 @@ class RaggedLevel(Level):
         """Let the sampler learn, where it is time, and average the samples per ray of the steps since."""
         if context.step % self.sampler.update_every and context.step != 1:
             return
-        super().on_step(context)
+        self.sampler.learn(self.field_density, context.step, context.key)
         self.counter.average()
+
+
+class SampleCounter(Part):
+    """Count samples on the device; `per_ray` is read on the host once after each average."""
+
+    counts: Int[Tensor, "3"]
+    """Samples and rays since the last average, and samples that exceeded the capacity, ever."""
+    mean: Float[Tensor, ""]
+    """Samples per ray before the last average; negative: unknown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("counts", torch.zeros(3, dtype=torch.int64))
+        self.register_buffer("mean", torch.tensor(-1.0))
+        self._per_ray: float | None = None
+
+    def add(self, samples: Int[Tensor, ""], rays: int, dropped: Int[Tensor, ""]) -> None:
+        """Count samples of rays, and those for which there was no room."""
+        counted = torch.stack([samples, torch.full_like(samples, rays), dropped])
+        with COUNTING:
+            self.counts += counted
+
+    def average(self) -> None:
+        """Take the mean over the rays since the last average."""
+        if int(self.counts[1]):
+            self.mean.copy_(self.counts[0] / self.counts[1])
+            self.counts[:2] = 0
+            self._per_ray = None
+
+    @property
+    def per_ray(self) -> float | None:
+        """The mean number of samples of a ray; None where it is not known yet."""
+        if self._per_ray is None:
+            self._per_ray = float(self.mean)
+        return self._per_ray if self._per_ray >= 0 else None
+
+    def sample_counts(self) -> list[Tensor]:
+        """Return samples and rays since the last average."""
+        return [self.counts]
+
+    def buffers_to_average(self) -> list[Tensor]:
+        """Return the samples per ray; `per_ray` reads them again after this."""
+        self._per_ray = None
+        return [self.mean]
+
+    def statistics(self) -> dict[str, float]:
+        """Return samples per ray, and samples for which there was no room."""
+        return {"speed/samples_per_ray": float(self.mean), "train/dropped_samples": float(self.counts[2])}
+
+    def reset_statistics(self) -> None:
+        """Forget all counts."""
+        self.counts.zero_()
+        self.mean.fill_(-1.0)
+        self._per_ray = None
+
+    def reset_parameters(self) -> None:
+        """Forget all counts."""
+        self.reset_statistics()
+
+    def validate_state(self) -> None:
+        """Check what was loaded.
+
+        Raises:
+            InputError: negative counts, or a mean that cannot be.
+        """
+        if bool((self.counts < 0).any()) or not -1.0 <= float(self.mean) <= MOST_PER_RAY:
+            raise InputError(f"The samples per ray in the model's state are not valid counts. {ANOTHER}")
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._per_ray = None
+
+
+def average_counts(module: nn.Module) -> None:
+    """Let every counter within a module take the mean over the rays since its last average."""
+    for part in module.modules():
+        if isinstance(part, SampleCounter):
+            part.average()

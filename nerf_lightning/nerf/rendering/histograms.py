@@ -8,12 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.histograms import op
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 
 
-@with_kernel(op.sample)
+@with_kernel("histograms.cpu", "histograms.cuda")
 def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],

@@ -20,10 +20,8 @@ def soften_near_gradients(
     Args:
         output: density and color of samples.
         distance: from the camera, scene units.
-        whole_from: from this distance on gradients are whole; 0: everywhere.
+        whole_from: from this distance on gradients are whole, > 0.
     """
-    if whole_from == 0:
-        return output
     share = (distance.detach() / whole_from).square().clamp(max=1.0)
     channels = {name: _Scaled.apply(each, share[..., None]) for name, each in output.channels.items()}
     density, rgb = _Scaled.apply(output.density, share), _Scaled.apply(output.rgb, share[..., None])

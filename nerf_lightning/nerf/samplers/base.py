@@ -23,15 +23,6 @@ class Sampler(Part):
     max_intervals: int = 1 << 17
     """So many steps at most are taken along a ray: near and far may come out of a file."""
 
-    def learn(self, density: DensityFn, step: int, key: int) -> None:
-        """Learn from the field between steps of training.
-
-        Args:
-            density: the field's.
-            step: steps that this attempt has taken.
-            key: of the next step's random numbers.
-        """
-
     def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density where rays look for it; 0 where they pass over, whatever the field says."""
         return density(positions)
@@ -81,6 +72,15 @@ class RaggedSampler(Sampler, ABC):
     @abstractmethod
     def samples_at_first(self) -> int:
         """How many samples a ray is taken to have until they have been counted."""
+
+    def learn(self, density: DensityFn, step: int, key: int) -> None:
+        """Learn from the field between steps of training.
+
+        Args:
+            density: the field's.
+            step: steps that this attempt has taken.
+            key: of the next step's random numbers.
+        """
 
     @abstractmethod
     def forward(self, rays: RayBundle, random: RayRandom | None) -> RaggedSamples:

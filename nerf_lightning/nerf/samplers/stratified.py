@@ -5,7 +5,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.histograms import op
 from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import DenseSampler
@@ -51,7 +50,7 @@ class StratifiedSampler(DenseSampler):
         return self.num_samples
 
 
-@with_kernel(op.stratified)
+@with_kernel("histograms.cpu", "histograms.cuda")
 def stratified_edges(
     shares: Float[Tensor, "edges"],
     jitter: Float[Tensor, "*rays inner"] | None,

@@ -38,6 +38,11 @@ class TensorStruct:
         self.map(note)
         return found
 
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are, all on one device."""
+        return next(each.device for each in vars(self).values() if isinstance(each, Tensor))
+
     def to(self: Struct, device: torch.device | str, non_blocking: bool = False) -> Struct:
         """Return a copy on `device`."""
         return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))

@@ -9,7 +9,7 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import require_positive
-from nerf_lightning.nerf.types.step_output import StepOutput
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 
 log = logging.getLogger(__name__)

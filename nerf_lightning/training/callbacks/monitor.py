@@ -8,9 +8,9 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.psnr import psnr
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.watcher import Watcher
 
 GIGABYTE = 1e9

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from nerf_lightning.messages.console import spoken
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.psnr import psnr
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.launch.trainer import MOST_STEPS
 
 EARLY = 0.05

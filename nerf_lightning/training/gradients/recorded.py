@@ -17,10 +17,9 @@ from torch import Tensor
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.objective import Objective
+from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.part import parts_of, sample_counts
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.gradients.tiles import Share, TileGradients
 from nerf_lightning.training.step_guard import StepGuard
 

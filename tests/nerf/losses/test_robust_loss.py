@@ -6,6 +6,8 @@ from support.scenes import ball_scene
 from nerf_lightning.data.ray_batches import RayBatches, gather_batch
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.robust import RobustLoss, kept_pixels, residuals
+from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
+from nerf_lightning.nerf.part import end_step
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import PixelIndex, Target
 from nerf_lightning.nerf.types.renderings import Rendering
@@ -68,7 +70,7 @@ def test_the_threshold_comes_down_to_the_quantile_and_the_passer_by_is_left_out_
     plain = MeanSquaredError()([seen(truth)] * 2, target(photograph, weight))
     torch.testing.assert_close(loss([seen(truth)] * 2, target(photograph, weight)), plain)  # at first all are kept
     for _ in range(200):
-        loss.learn(truth, photograph, weight)
+        loss.after_step(truth, photograph, weight)
     assert float(loss.threshold) == pytest.approx(4e-4, rel=1e-3)
     levels = loss([seen(truth)] * 2, target(photograph, weight))["color"]
     # Three quarters of the pixels: none of the passer-by has as many good neighbors as bad ones.
@@ -77,16 +79,23 @@ def test_the_threshold_comes_down_to_the_quantile_and_the_passer_by_is_left_out_
     torch.testing.assert_close(loss([seen(truth)] * 2, target(photograph, weight)), plain)
 
 
+def test_a_loss_within_others_learns_too():
+    truth, photograph = a_passer_by()
+    inner = RobustLoss(MeanSquaredError(), share=0.7, patch=PATCH)
+    end_step(WeightedSum({"outer": RobustLoss(inner, patch=PATCH)}), truth, photograph, torch.ones(len(truth)))
+    assert float(inner.threshold) < 1.0
+
+
 def test_masked_pixels_and_steps_without_any_other_teach_nothing():
     truth, photograph = a_passer_by()
     loss = RobustLoss(MeanSquaredError(), share=1.0, times=4.0, patch=PATCH)
     weight = (photograph[:, 0] < 0.5).float()
     for _ in range(200):
-        loss.learn(truth, photograph, weight)
+        loss.after_step(truth, photograph, weight)
     assert float(loss.threshold) == pytest.approx(4e-4, rel=1e-3)
     before = loss.threshold.clone()
-    loss.learn(truth, photograph, torch.zeros_like(weight))
-    loss.learn(truth * torch.nan, photograph, weight)
+    loss.after_step(truth, photograph, torch.zeros_like(weight))
+    loss.after_step(truth * torch.nan, photograph, weight)
     assert torch.equal(loss.threshold, before)
 
 
@@ -114,7 +123,7 @@ def test_of_a_planted_ball_most_is_left_out_and_of_what_the_scene_explains_hardl
     # The scene is known up to noise.
     seen = clean + 0.02 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
     for _ in range(100):
-        loss.learn(seen, photograph, torch.ones(len(pixels.x)))
+        loss.after_step(seen, photograph, torch.ones(len(pixels.x)))
     kept = kept_pixels(residuals(seen, photograph) <= loss.threshold, loss.patch)
     ball = (photograph - clean).abs().amax(dim=-1) > 0
     assert float(ball.float().mean()) > 0.03

@@ -16,9 +16,14 @@ from nerf_lightning.nerf.losses.proposal import ProposalLoss
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.ray_generator import (
+    RayGenerator,
+    Subpixels,
+    for_each_ray,
+    mean_over_pixels,
+    random_of_rays,
+)
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.part import StepContext, fit_parts
 from nerf_lightning.nerf.randomness import batch_random, fold

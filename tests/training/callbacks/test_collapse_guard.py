@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
+from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.types.rays import PixelIndex
-from nerf_lightning.nerf.types.step_output import StepOutput
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard, is_constant
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.launch.preemption import stop_signals

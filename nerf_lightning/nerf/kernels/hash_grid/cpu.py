@@ -19,7 +19,7 @@ from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
 
 POINTS = 64
 """So many are taken at a time: their cells are found by vectors, and then what stands there is fetched. Found one by
@@ -93,7 +93,7 @@ def point_gradient(
 
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+    from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
 
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3)
     table, grad = torch.zeros(layout.offsets[-1], FEATURES), torch.ones(4, 2 * FEATURES)

@@ -15,7 +15,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 
 if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
 
 BLOCK = 128
 
@@ -79,7 +79,7 @@ def point_gradient(
 
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+    from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
 
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
     table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 """Of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table's size (Eq. 4)."""

@@ -15,63 +15,70 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.contraction import TINY
 from nerf_lightning.nerf.kernels.histograms.ray_loss import RayLoss
 from nerf_lightning.nerf.kernels.threads import over_rows
+from nerf_lightning.nerf.kernels.with_kernel import are_rows
+from nerf_lightning.nerf.types.renderings import DenseRendering
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 LEAST_LEFT = np.float32(TINY)
 
 
-def sample(
-    edges: Float[Tensor, "rays edges"],
-    weights: Float[Tensor, "rays bins"],
-    u: Float[Tensor, "rays count"],
-    floor: float,
-    contracted: bool,
-) -> Float[Tensor, "rays count"]:
+def sample_histogram(
+    edges: Float[Tensor, "*rays edges"],
+    weights: Float[Tensor, "*rays bins"],
+    u: Float[Tensor, "*rays count"],
+    floor: float = 1e-5,
+    contracted: bool = False,
+) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
+    if not are_rows(edges, weights, u) or edges.requires_grad or weights.requires_grad:
+        return None
+    if edges.shape[1] != weights.shape[1] + 1:
+        return None
     out = torch.empty(u.shape)
     arrays = (each.detach().contiguous().numpy() for each in (edges, weights, u))
     over_rows(_sample, len(u), *arrays, np.float32(floor), contracted, out.numpy())
     return out
 
 
-def stratified(
+def stratified_edges(
     shares: Float[Tensor, "edges"],
-    jitter: Float[Tensor, "rays inner"] | None,
-    low: Float[Tensor, "rays"],
-    high: Float[Tensor, "rays"],
+    jitter: Float[Tensor, "*rays inner"] | None,
+    low: Float[Tensor, "*rays"],
+    high: Float[Tensor, "*rays"],
     contracted: bool,
-) -> Float[Tensor, "rays edges"]:
+) -> Float[Tensor, "*rays edges"] | None:
     """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
+    if low.dim() != 1 or low.dtype != torch.float32 or low.requires_grad or high.requires_grad:
+        return None
     out, shift = torch.empty(len(low), len(shares)), torch.empty(len(low), 0) if jitter is None else jitter
     arrays = (each.contiguous().numpy() for each in (shares, shift, low, high))
     over_rows(_stratified, len(low), *arrays, contracted, out.numpy())
     return out
 
 
-def interlevel(
-    t: Float[Tensor, "rays edges"],
-    w: Float[Tensor, "rays samples"],
-    u: Float[Tensor, "rays outer"],
-    v: Float[Tensor, "rays bins"],
-) -> Float[Tensor, "rays"]:
-    """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
-    return RayLoss.apply(_over_rays(_interlevel), v, t, w, u)
+def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"] | None:
+    """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for the proposal's weights."""
+    if not are_rows(last.weights, proposal.weights):
+        return None
+    given = last.samples.edges, last.weights, proposal.samples.edges
+    return RayLoss.apply(_over_rays(_interlevel), proposal.weights, *map(Tensor.detach, given))
 
 
-def distortion(
-    edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"], contracted: bool
-) -> Float[Tensor, "rays"]:
-    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
-    return RayLoss.apply(_over_rays(_distortion, contracted), w, edges)
+def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"] | None:
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for the weights alone."""
+    edges, w = rendering.samples.edges, rendering.weights
+    if not are_rows(w) or edges.requires_grad:
+        return None
+    return RayLoss.apply(_over_rays(_distortion, rendering.samples.contracted_spacing), w, edges)
 
 
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]]), torch.ones(1, 2)
-    sample(edges, weights, torch.tensor([[0.5]]), 0.01, True)
-    stratified(edges[0], torch.zeros(1, 1), edges[:, 0], edges[:, 2], True)
-    interlevel(edges, weights, edges, weights)
-    distortion(edges, weights, True)
+    sample_histogram(edges, weights, torch.tensor([[0.5]]), 0.01, True)
+    stratified_edges(edges[0], torch.zeros(1, 1), edges[:, 0], edges[:, 2], True)
+    RayLoss.apply(_over_rays(_interlevel), weights, edges, weights, edges)
+    RayLoss.apply(_over_rays(_distortion, True), weights, edges)
 
 
 def _over_rays(kernel: Any, *flags: bool) -> Callable[..., None]:

@@ -10,11 +10,16 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.threads import over_rows
 
 
-def undistort(plane: Float[Tensor, "rays 2"], lens: Float[Tensor, "rays 6"], steps: int) -> Float[Tensor, "rays 2"]:
-    """Return where the lens takes its places in the plane from."""
-    out = torch.empty_like(plane)
-    over_rows(_undistort, len(plane), plane.contiguous().numpy(), lens.contiguous().numpy(), steps, out.numpy())
-    return out
+def undistort(
+    plane: Float[Tensor, "*points 2"], lens: Float[Tensor, "*#points 6"], steps: int
+) -> Float[Tensor, "*points 2"] | None:
+    """Return where the lens takes its places in the plane from; None where gradients are wanted."""
+    if plane.requires_grad or lens.requires_grad:
+        return None
+    rows, of_rows = plane.reshape(-1, 2), lens.expand(*plane.shape[:-1], 6).reshape(-1, 6)
+    out = torch.empty_like(rows)
+    over_rows(_undistort, len(rows), rows.contiguous().numpy(), of_rows.contiguous().numpy(), steps, out.numpy())
+    return out.view(plane.shape)
 
 
 def trial() -> None:

@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from numba import njit
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
@@ -23,7 +22,7 @@ def march(
     """Return the occupied intervals and where each ray would go on."""
     count, edges = rays.near.shape[0], lattice.shape[0]
     most = min(edges, limit if limit is not None else edges)
-    ray = (*in_box(rays, grid), state.enter, state.leave, state.jitter)
+    ray = (*grid.in_box(rays), state.enter, state.leave, state.jitter)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
     arrays = (*ray, lattice, grid.cells, grid.leaps, state.next, numbers, bounds, following)
@@ -33,12 +32,6 @@ def march(
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
     over_rows(_pack, count, *(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
     return RaggedSamples(*out, bounds, bounds[-1], most), following
-
-
-def in_box(rays: RayBundle, grid: OccupancyCells) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-    """Return origins and directions in coordinates of the grid's box, which is the cube from -1 to 1."""
-    center, half = center_and_half(grid.aabb)
-    return (rays.origins - center) / half, rays.directions / half
 
 
 def trial() -> None:

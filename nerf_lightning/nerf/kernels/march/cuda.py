@@ -60,8 +60,10 @@ def march(
 
 def distances_in_box(
     rays: RayBundle, aabb: Float[Tensor, "2 3"]
-) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
-    """Return where each ray enters and leaves a box (`geometry.boxes.distances_in_box`)."""
+) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]] | None:
+    """Return where each ray enters and leaves a box; None where rays are not in a row, or gradients are wanted."""
+    if rays.near.dim() != 1 or rays.origins.requires_grad or rays.directions.requires_grad:
+        return None
     enter, leave = torch.empty_like(rays.near), torch.empty_like(rays.near)
     if count := rays.near.shape[0]:
         given = rays.origins, rays.directions, rays.near, rays.far, aabb
@@ -78,7 +80,7 @@ def trial(device: str = "cuda") -> None:
     aabb = torch.tensor([[-1.0] * 3, [1.0] * 3], device=device)
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     lattice = torch.linspace(1.0, 3.2, 12, device=device)
-    enter, leave = distances_in_box(rays, aabb)
+    enter, leave = distances_in_box(rays, aabb) or (one, one)
     samples, _ = march(rays, MarchState(enter, leave, 0 * one, 0 * one.long()), lattice, grid, None, None)
     if int(samples.found) != 10:
         raise RuntimeError("a trial of its kernels gave wrong numbers")

@@ -8,6 +8,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from nerf_lightning.nerf.geometry.boxes import center_and_half
+from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 BLOCK = 4
@@ -26,6 +28,11 @@ class OccupancyCells(TensorStruct):
     """1 where occupied."""
     leaps: UInt8[Tensor, "a b c"]
     """What `leaps_over` says of each block of cells: how much around it is empty."""
+
+    def in_box(self, rays: RayBundle) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+        """Return origins and directions in coordinates of the box, which is the cube from -1 to 1."""
+        center, half = center_and_half(self.aabb)
+        return (rays.origins - center) / half, rays.directions / half
 
 
 def blocks_of(cells: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "a b c"]:

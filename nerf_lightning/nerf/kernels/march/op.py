@@ -40,12 +40,3 @@ def march(
     from nerf_lightning.nerf.kernels.march.reference import march_torch
 
     return march_torch(rays, state, lattice, grid, limit, capacity)
-
-
-def distances_in_box(
-    rays: RayBundle, aabb: Float[Tensor, "2 3"]
-) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]] | None:
-    """Do what `geometry.boxes.distances_in_box` does, by a kernel, without gradients; None where there is none."""
-    plain = rays.near.dim() == 1 and not (rays.origins.requires_grad or rays.directions.requires_grad)
-    kernels = cuda_backend("march.cuda", rays.near.device) if plain else None
-    return None if kernels is None else kernels.distances_in_box(rays, aabb)

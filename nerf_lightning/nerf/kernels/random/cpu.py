@@ -1,6 +1,5 @@
 """Random numbers and permutations for the CPU, bit for bit those of `nerf.randomness`."""
 
-from collections.abc import Sequence
 from typing import no_type_check
 
 import numpy as np
@@ -10,21 +9,26 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.threads import over_rows
+from nerf_lightning.nerf.randomness import grid_of, round_words
 
 
 def uniform(
-    keys: Int[Tensor, "rays"], slots: Int[Tensor, "rays"], purpose: int, count: int
-) -> Float[Tensor, "rays {count}"]:
-    """Return `count` numbers per ray, uniform on [0, 1)."""
+    keys: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], purpose: int, count: int
+) -> Float[Tensor, "*rays {count}"] | None:
+    """Return `count` numbers per ray, uniform on [0, 1); None where rays are not in a row."""
+    if slots.dim() != 1:
+        return None
     out = torch.empty(len(slots), count)
     over_rows(_uniform, len(slots), keys.numpy(), slots.numpy(), np.uint32(purpose), out.numpy())
     return out
 
 
-def permute(index: Int[Tensor, "n"], rows: int, columns: int, size: int, words: Sequence[int]) -> Tensor:
-    """Return where a permutation of range(size) sends each index, given the words of its rounds."""
-    out = torch.empty_like(index)
-    _permute(0, len(index), index.contiguous().numpy(), rows, columns, size, np.array(words), out.numpy())
+def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"] | None:
+    """Return where a permutation of range(size) sends each index; None where they are not in a row, with one key."""
+    if key.numel() != 1 or index.dim() != 1:
+        return None
+    out, words = torch.empty_like(index), np.array(round_words(int(key)))
+    _permute(0, len(index), index.contiguous().numpy(), *grid_of(size), size, words, out.numpy())
     return out
 
 
@@ -32,7 +36,7 @@ def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
     one = torch.ones(1, dtype=torch.int64)
     uniform(one, one, 1, 1)
-    permute(one, 1, 2, 2, [1])
+    permute(one, 2, one)
 
 
 @njit

@@ -12,9 +12,11 @@ BLOCK = 512
 
 
 def uniform(
-    keys: Int[Tensor, "rays"], slots: Int[Tensor, "rays"], purpose: int, count: int
-) -> Float[Tensor, "rays {count}"]:
-    """Return `count` numbers per ray, uniform on [0, 1)."""
+    keys: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], purpose: int, count: int
+) -> Float[Tensor, "*rays {count}"] | None:
+    """Return `count` numbers per ray, uniform on [0, 1); None where rays are not in a row."""
+    if slots.dim() != 1:
+        return None
     out = torch.empty(len(slots), count, device=slots.device)
     if out.numel():
         grid = (triton.cdiv(out.numel(), BLOCK),)
@@ -25,7 +27,8 @@ def uniform(
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
     one = torch.ones(1, dtype=torch.int64, device=device)
-    if not 0.0 <= float(uniform(one, one, 1, 1)) < 1.0:
+    found = uniform(one, one, 1, 1)
+    if found is None or not 0.0 <= float(found) < 1.0:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 

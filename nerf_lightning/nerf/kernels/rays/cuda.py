@@ -1,7 +1,7 @@
 """Rays through pixels for CUDA, of pinholes and of radial and tangential lenses.
 
 One kernel does what `geometry.cameras.rays_through_pixels` does, with the iteration of `geometry.lenses` and the sides
-of pixels of `geometry.cones`. `TRITON_INTERPRET=1` runs it without a GPU.
+of pixels. `TRITON_INTERPRET=1` runs it without a GPU.
 """
 
 from typing import no_type_check
@@ -20,29 +20,29 @@ LENSES: tuple[LensModel, ...] = ("pinhole", "radial_tangential")
 BLOCK = 128
 
 
-def takes(cameras: Cameras) -> bool:
-    """Tell whether the kernel knows the lens, and nobody wants gradients or normalized device coordinates."""
-    learnt = (cameras.c2w, cameras.focal, cameras.center, cameras.lens)
-    known = cameras.lens_model in LENSES and cameras.ndc is None
-    return known and all(each.dtype == torch.float32 and not each.requires_grad for each in learnt)
-
-
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
-    per_side: int,
-) -> RayBundle:
-    """Return the rays through the centers of pixels.
+    subpixel_offset: Float[Tensor, "*#rays 2"] | None = None,
+    per_side: int = 1,
+) -> RayBundle | None:
+    """Return the rays through the centers of pixels; None for other places in them, lenses, coordinates or gradients.
 
     Args:
-        cameras: one per view, of which `takes` is true.
+        cameras: one per view.
         pixels: which.
         near: where the rays of each view begin.
         far: where they end.
+        subpixel_offset: from the center of its pixel to where each ray passes; None: none.
         per_side: so many rays share each side of a pixel.
     """
+    learnt = (cameras.c2w, cameras.focal, cameras.center, cameras.lens)
+    if subpixel_offset is not None or cameras.ndc is not None or cameras.lens_model not in LENSES:
+        return None
+    if any(each.dtype != torch.float32 or each.requires_grad for each in learnt):
+        return None
     shape, device = pixels.view.shape, cameras.c2w.device
     origins, directions = (torch.empty(*shape, 3, device=device) for _ in range(2))
     begin, end = (torch.empty(shape, device=device) for _ in range(2))
@@ -67,8 +67,8 @@ def trial(device: str = "cuda") -> None:
     given = c2w, one.expand(2, 2), 0.5 * one.expand(2, 2), lens
     pixel = PixelIndex(zero, zero, zero)
     # Along the axis.
-    found = [rays_through_pixels(Cameras(*given, model, size, size), pixel, one, 2 * one, 1) for model in LENSES]
-    if not all(torch.allclose(each.directions, -c2w[..., 2]) for each in found):
+    found = [rays_through_pixels(Cameras(*given, model, size, size), pixel, one, 2 * one) for model in LENSES]
+    if not all(each is not None and torch.allclose(each.directions, -c2w[..., 2]) for each in found):
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 

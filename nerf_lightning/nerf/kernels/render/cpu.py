@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW as LARGEST_RAW_DENSITY
 from nerf_lightning.nerf.kernels.hash_grid.cpu import FEATURES, encode, level_arrays
-from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
-from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
+from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
+from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, next_occupied
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
@@ -30,7 +30,7 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     through,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
@@ -104,7 +104,7 @@ def along(
     rays: RayBundle, field: FieldParts, state: MarchState, lattice: Tensor, grid: OccupancyCells
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
     """Return what kernels take of rays: the march, where they run through the world, and features of directions."""
-    march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
+    march = (*grid.in_box(rays), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
     world, directions = (rays.origins, rays.directions, field.aabb), field.ray_features(rays)
     return arrays_of(march), arrays_of(world), arrays_of((directions.float(),))[0]
 

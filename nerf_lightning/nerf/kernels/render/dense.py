@@ -19,8 +19,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays, write_point_gradient
-from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
-from nerf_lightning.nerf.kernels.hash_grid.op import table_gradient
+from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout, table_gradient
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
     ROWS,
@@ -36,7 +35,7 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
 from nerf_lightning.nerf.kernels.mlp.vectors import LANES, bytes_of, round_vector
 from nerf_lightning.nerf.kernels.render.compositing import BACK, COLOR, LIGHT, SHARE, WEIGHT, absorb, new_rooms, shade
 from nerf_lightning.nerf.kernels.render.cpu import arrays_of, network
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.kernels.render.workspace import NUMBERS, Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle

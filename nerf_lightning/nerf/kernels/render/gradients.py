@@ -54,7 +54,7 @@ from nerf_lightning.nerf.kernels.render.cpu import (
     start,
     trial_arguments,
 )
-from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle

@@ -14,10 +14,14 @@ from torch import Tensor
 BLOCK = 256
 
 
-def spherical_harmonics(directions: Float[Tensor, "points 3"], degree: int) -> Float[Tensor, "points features"]:
-    """Return Y_lm of unit directions, l below `degree`."""
-    count = directions.shape[0]
-    out = torch.empty(count, degree * degree, device=directions.device)
+def spherical_harmonics(
+    directions: Float[Tensor, "*points 3"], degree: int
+) -> Float[Tensor, "*points features"] | None:
+    """Return Y_lm of unit directions, l below `degree`; None where they are not float32, or gradients are wanted."""
+    if directions.dtype != torch.float32 or directions.requires_grad:
+        return None
+    count = directions.numel() // 3
+    out = torch.empty(*directions.shape[:-1], degree * degree, device=directions.device)
     if count:
         _harmonics[(triton.cdiv(count, BLOCK),)](directions.contiguous(), out, count, degree, BLOCK)
     return out
@@ -26,7 +30,8 @@ def spherical_harmonics(directions: Float[Tensor, "points 3"], degree: int) -> F
 def trial(device: str = "cuda") -> None:
     """Run the kernel once on next to nothing; it raises whatever its compiler or driver raises."""
     for degree in range(1, 5):
-        if not bool(spherical_harmonics(torch.ones(1, 3, device=device), degree).isfinite().all()):
+        found = spherical_harmonics(torch.ones(1, 3, device=device), degree)
+        if found is None or not bool(found.isfinite().all()):
             raise RuntimeError("a trial of its kernels gave numbers that are not finite")
 
 
