@@ -9,6 +9,8 @@ from torch.nn import functional
 
 from nerf_lightning.data.captures.left_out import ALL_CAMERAS
 from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, Given, look, not_judged, ok, rows_at_once, wrong
+from nerf_lightning.doctor.conventions import FLIP_YZ, axes
+from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import image_plane
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
@@ -25,6 +27,7 @@ FEW_MATCHES = 30
 STEP = 10.0  # Degrees between neighbors of a good ring of photographs.
 # Degrees between a held-out view and the nearest one that is learned from.
 FAR_HELD_OUT = 40.0
+CLEARLY_MORE = 0.05  # Of the matched details: more than chance makes.
 SOUND = 0.5  # Share of matched details that lie where the cameras say, from which on the axes are right.
 
 
@@ -65,9 +68,18 @@ def common_middle(evidence: Given) -> Check:
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
         if isinstance(evidence, Evidence) and evidence.agreement >= SOUND:
             return look(f"{message}, and the photographs agree with the poses", "Nothing, if they look outward.")
+        # In a box lies what all cameras look at.
+        if isinstance(evidence, Evidence) and evidence.scene.space != "bounded" and not _fits_opencv(evidence):
+            return look(f"{message}, and the photographs do not tell whether that is right", cure)
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
     cure = "See doctor.png: the cameras should face what was photographed. If not, see the check of axes."
     return look(f"only {100 * ahead:.0f} % of the cameras face a common focus point", cure)
+
+
+def _fits_opencv(evidence: Evidence) -> bool:
+    """Return whether clearly more of the matched details lie where the cameras say if their axes are OpenCV's."""
+    flipped = agreeing(evidence.matches, axes(evidence.scene.cameras.c2w, FLIP_YZ))
+    return int(flipped.sum()) - int(evidence.agrees.sum()) > CLEARLY_MORE * len(flipped)
 
 
 def upright(evidence: Given) -> Check:

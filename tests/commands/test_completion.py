@@ -37,7 +37,7 @@ def test_commands_groups_options_keys_and_values():
     assert completed("no_command", "x") == []
     assert completed() == sorted(NAMES)
     assert completed("train", "-m", "model=nerf,fast_d") == ["model=nerf,fast_dense"]
-    assert completed("train", "scene=colmap", "scene.f") == ["scene.far=", "scene.frame=", "scene.frames="]
+    assert completed("train", "scene=colmap", "scene.f") == ["scene.far=", "scene.frames="]
     assert "scene.file=" in completed("train", "scene=transforms", "scene.f")
 
 

@@ -156,9 +156,9 @@ def given_extent(capture: Capture, near: float | None, far: float | None, aabb_h
     box = capture.box if aabb_half is None else _cube(aabb_half)
     if near is None or far is None or box is None:
         raise InputError(
-            f"scene.frame=given needs the distances between which content lies and its box, and {capture.source} does "
-            "not give them. Set scene.near, scene.far and scene.aabb_half, for example scene.near=2 scene.far=6 "
-            "scene.aabb_half=1.5, or use scene.frame=fitted."
+            "scene.coordinates=given needs the distances between which content lies and its box, and "
+            f"{capture.source} does not give them. Set scene.near, scene.far and scene.aabb_half, for example "
+            "scene.near=2 scene.far=6 scene.aabb_half=1.5, or use scene.coordinates=fitted."
         )
     views = len(capture.views)
     eye = torch.eye(4, dtype=torch.float64)

@@ -11,8 +11,8 @@ from jaxtyping import UInt8
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import usable
+from nerf_lightning.data.captures.intrinsics import cameras_of
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.reader import cameras_of
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.plain_background import background_for

@@ -3,54 +3,40 @@
 import logging
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal, TypeVar, get_args
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import (
-    FARTHEST,
-    LEAST_FOCAL,
-    cameras_as_given,
-    check_metres,
-    check_step,
-    usable,
-)
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.checks import check_metres, check_step, usable
+from nerf_lightning.data.captures.folders import located, named_folder, require_one
+from nerf_lightning.data.captures.intrinsics import as_calibrated, cameras_of
 from nerf_lightning.data.captures.masks import with_masks
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
-from nerf_lightning.data.captures.scene import Frame, Spaces, check_extent, scene_of
+from nerf_lightning.data.captures.scene import Coordinates, Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
-from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, read_header
+from nerf_lightning.data.pixels.images import MaskColor
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz
-from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene
+from nerf_lightning.nerf.types.scene import Background, PixelStore, Scene
 
 OF_PANORAMAS = 3.2
 """How many times as long as photographs panoramas may be, whose pixels cover all directions."""
-PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "train")
-"""Folders within a capture, whose parent is meant where one of them is given."""
-DEEPEST, MOST_FOLDERS = 3, 1000
-"""How far below a folder, and in how many folders of a level, captures are looked for."""
 
-Found = TypeVar("Found")
 Axes = Literal["opengl", "opencv"]
 Poses = Literal["c2w", "w2c"]
-LARGEST_STRETCH = 0.01
-"""Of width and height: how far a picture's scale may differ from one axis to the other."""
 
 log = logging.getLogger(__name__)
 
@@ -75,12 +61,12 @@ class CaptureReader(Reader):
         axes: opengl, or opencv where the cameras in the files have axes right, down, forward although the format's are
             others; the doctor recognizes it.
         poses: c2w (camera to world), or w2c (world to camera) where the files have the inverse of the format's poses.
-        frame: fitted (upright, centered, of a handy size), or given: poses, near, far and the box are kept as files or
-            settings give them.
+        coordinates: fitted (upright, centered, of a handy size), or given: poses, near, far and the box are kept as
+            files or settings give them.
         near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
-        aabb_half: half the side of the box around the origin that holds the content, with frame=given; null: the box
-            that the capture has.
+        aabb_half: half the side of the box around the origin that holds the content, with coordinates=given; null: the
+            capture's box.
         metres_per_unit: length of the capture's unit in meters, if known: depths are then in meters, and GLB files have
             their true size. Capture formats do not store it. null: unknown.
         cut_out: if opaque photographs show an object on a plain background, make that transparent.
@@ -107,7 +93,7 @@ class CaptureReader(Reader):
     space: Spaces = "auto"
     axes: Axes = "opengl"
     poses: Poses = "c2w"
-    frame: Frame = "fitted"
+    coordinates: Coordinates = "fitted"
     near: float | None = None
     far: float | None = None
     aabb_half: float | None = None
@@ -170,7 +156,7 @@ class CaptureReader(Reader):
             background=background_for(self.background, color, self.behind),
             protocol=protocol | remembered,
             metres_per_unit=self.metres_per_unit,
-            frame=self.frame,
+            coordinates=self.coordinates,
             aabb_half=self.aabb_half,
         )
 
@@ -205,7 +191,7 @@ class CaptureReader(Reader):
     @cached_property
     def found_folder(self) -> Path:
         """What `folder` returns, searched for once; who has searched already sets it."""
-        folder = self.named_folder()
+        folder = named_folder(self.root)
         found = located(folder, lambda path: path if self.found_in(path) else None)
         require_one(found, self.root)
         if found and found[0] != folder:
@@ -214,7 +200,7 @@ class CaptureReader(Reader):
 
     def top(self) -> Path:
         """Return the folder that may hold pictures: the capture's, or the one above it that the user named."""
-        named, folder = self.named_folder(), self.folder()
+        named, folder = named_folder(self.root), self.folder()
         return named if folder.is_relative_to(named) else folder
 
     def below(self, name: str) -> Path:
@@ -222,34 +208,22 @@ class CaptureReader(Reader):
         paths = [self.top() / name, self.folder() / name]
         return next(filter(os.path.lexists, paths), paths[-1])
 
-    def named_folder(self) -> Path:
-        """Return the folder that the user named, or the one of the file; `InputError` says that there is none."""
-        try:
-            folder = Path(self.root).expanduser()
-        except RuntimeError as error:
-            raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
-        if os.path.isfile(folder):
-            return folder.parent
-        if not os.path.isdir(folder):
-            where = (
-                ""
-                if folder.is_absolute() or os.path.lexists(folder)
-                else f" in {Path.cwd()}, where relative ones are looked for"
-            )
-            raise InputError(f"The folder {folder} {what_is(folder)}{where}. Set scene.root to the capture's folder.")
-        return folder
-
     def _decoded(self, capture: Capture, downscale: int) -> tuple[Capture, PixelStore]:
         """Return the pixels, and the capture without the views whose photograph or mask cannot be decoded."""
         cache, label = Path(self.cache_dir) if self.cache_dir else None, f"Reading {Path(self.root).name}"
-
-        def read(views: Sequence[View]) -> PixelStore:
+        while True:
             photographs = [
-                replace(view.photograph, mask_keeps=view.photograph.mask_keeps or self.masks_keep) for view in views
+                replace(view.photograph, mask_keeps=view.photograph.mask_keeps or self.masks_keep)
+                for view in capture.views
             ]
-            return read_photographs(photographs, downscale, cache, self.verify, label)
-
-        return decoded(capture, read)
+            try:
+                return capture, read_photographs(photographs, downscale, cache, self.verify, label)
+            except UndecodableError as error:
+                names = [view.name for view in capture.views]
+                capture.left_out.faults |= {names[number]: fault for number, fault in error.faults.items()}
+                kept = [number for number in range(len(names)) if number not in error.faults]
+                capture.left_out.require_enough(len(kept))
+                capture = capture.some(kept)
 
     def _factor(self, capture: Capture) -> int:
         """Return by what the photographs shrink."""
@@ -272,7 +246,7 @@ class CaptureReader(Reader):
         require_one_of(get_args(Poses), **{"scene.poses": self.poses})
         check_metres(self.metres_per_unit)
         background_for(self.background, None, self.behind)
-        check_extent(self.space, self.near, self.far, self.frame, self.aabb_half)
+        check_extent(self.space, self.near, self.far, self.coordinates, self.aabb_half)
 
     def _wanted(self, capture: Capture) -> Capture:
         """Return the views whose names fit the pattern `frames`."""
@@ -313,61 +287,6 @@ class CaptureReader(Reader):
         return {"train": train, "val": val or test, "test": test or val}, "test" if test else "val"
 
 
-def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:
-    """Return what a folder holds, as a list of one; or the capture that it is a part of, or those that lie below it.
-
-    Args:
-        folder: as the user named it.
-        capture_in: returns what a folder itself holds, None where it holds no capture.
-    """
-
-    def near(path: Path) -> Found | None:
-        try:
-            return capture_in(path)
-        except (OSError, InputError):  # it is not the user's
-            return None
-
-    known, part = capture_in(folder), folder.resolve()
-    if known and (part.name not in PARTS or pictures_below(folder)):
-        return [known]
-    while part.name in PARTS:
-        part = part.parent
-        if whole := near(part):
-            return [whole]
-    found, below = [known] if known else [], [folder]
-    for _ in range(0 if found else DEEPEST):
-        below = [path for each in below for path in _folders_in(each)][:MOST_FOLDERS]
-        found = found or [known for path in below if (known := near(path))]
-    return found
-
-
-def require_one(folders: Sequence[Path], root: str) -> None:
-    """Refuse a folder `root` that holds several captures."""
-    if len(folders) > 1:
-        choice = listed((f"scene.root={path}" for path in folders), 4)
-        raise InputError(f"{root} holds {len(folders)} captures. Choose one of them: {choice}.")
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_dir())
-    except OSError:  # may not be listed
-        return []
-
-
-def decoded(capture: Capture, read: Callable[[Sequence[View]], PixelStore]) -> tuple[Capture, PixelStore]:
-    """Return what `read` makes of the views, and the capture without those that it cannot decode."""
-    while True:
-        try:
-            return capture, read(capture.views)
-        except UndecodableError as error:
-            names = [view.name for view in capture.views]
-            capture.left_out.faults |= {names[number]: fault for number, fault in error.faults.items()}
-            kept = [number for number in range(len(names)) if number not in error.faults]
-            capture.left_out.require_enough(len(kept))
-            capture = capture.some(kept)
-
-
 def as_meant(capture: Capture, axes: Axes, poses: Poses) -> Capture:
     """Return a capture whose poses are camera to world with axes right, up, back, from what its files have instead."""
 
@@ -377,92 +296,3 @@ def as_meant(capture: Capture, axes: Axes, poses: Poses) -> Capture:
         return flip_yz(c2w) if axes == "opencv" else c2w
 
     return replace(capture, views=tuple(replace(view, c2w=turned(view.c2w)) for view in capture.views))
-
-
-def as_calibrated(capture: Capture) -> Capture:
-    """Return the capture with photographs turned where their EXIF tag says so and the camera's size fits that alone.
-
-    Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which. Those whose
-    photograph is unreadable, or fits its camera in neither way, are left out.
-    """
-    views, kept, turned = list(capture.views), [], []
-    for number, view in enumerate(views):
-        with capture.left_out.unless_usable(view.name):
-            header = view.photograph.header or read_header(view.photograph.path)
-            orientation, (width, height) = header.orientation, header.size
-            upright = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
-            views[number] = replace(view, photograph=replace(view.photograph, upright=upright, header=header))
-            require_fit(view, *((height, width) if upright else (width, height)))
-            kept.append(number)
-            if orientation != 1:
-                turned.append(number)
-    capture.left_out.require_enough(len(kept))
-    if turned:
-        as_shown = sum(views[number].photograph.upright for number in turned)
-        log.info(
-            "%s: %d of %d photographs are rotated by EXIF; the rotation is applied to %d, whose sizes match their "
-            "cameras only then, and not to the others",
-            *(capture.source, len(turned), len(kept), as_shown),
-        )
-    return replace(capture, views=tuple(views)).some(kept)
-
-
-def _fits(view: View, width: int, height: int) -> bool:
-    # A shrunk picture's size is rounded: allow a pixel on either side.
-    return abs(width / view.size[0] * view.size[1] / height - 1.0) <= LARGEST_STRETCH + 1.0 / min(width, height)
-
-
-def require_fit(view: View, width: int, height: int) -> None:
-    """Refuse a picture that is no shrunk copy of what its camera describes."""
-    if not _fits(view, width, height):
-        raise InputError(
-            f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for {view.size[0]:g} "
-            f"x {view.size[1]:g}: the sides differ by different factors ({width / view.size[0]:.3f} "
-            f"and {height / view.size[1]:.3f}). The picture was cropped, rotated or stretched after the poses were "
-            "estimated; use the original one."
-        )
-
-
-def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
-    """Return the cameras at the size of the pixels that were read.
-
-    The intrinsics hold for the sizes that the format names, `files` are (width, height) of each picture file, and what
-    `downscale` leaves over was cropped at the right and the bottom.
-
-    Raises:
-        InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are another capture's.
-    """
-    sizes = [downscaled_size(width, height, downscale) for width, height in files]
-    if sizes != list(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)):
-        raise InputError(
-            f"The cached pixels of {capture.source} have other sizes than its photographs, so something else wrote "
-            "them. Remove them from scene.cache_dir (by default ~/.cache/nerf_lightning), and the photographs will be "
-            "read again."
-        )
-
-    scales = []
-    for view, (width, height) in zip(capture.views, files, strict=True):
-        require_fit(view, width, height)
-        scales.append((width / view.size[0] / downscale, height / view.size[1] / downscale))
-    scale, given = torch.tensor(scales, dtype=torch.float64), cameras_as_given(capture)
-    focal = given.focal * scale
-    possible = ((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all(dim=-1)
-    if not bool(possible.all()):
-        view = capture.views[possible.tolist().index(False)]
-        raise InputError(
-            f"{capture.source}: the view {view.name} has a focal length of {view.focal[0]:g}, {view.focal[1]:g} pixels "
-            f"of {view.size[0]:g} x {view.size[1]:g}, which no lens has on the picture that is there. Export it again."
-        )
-    return replace(
-        given,
-        focal=focal.float(),
-        center=(given.center * scale).float(),
-        lens=given.lens.float(),
-        width=pixels.width,
-        height=pixels.height,
-    )
-
-
-def picture_files(folder: Path) -> list[str]:
-    """Return the names of the pictures in a folder and its subfolders, sorted as text."""
-    return sorted(path.relative_to(folder).as_posix() for path in pictures_below(folder))

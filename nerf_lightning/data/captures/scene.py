@@ -13,20 +13,22 @@ from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_use
 from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene, Space
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
-Frame = Literal["fitted", "given"]
+Coordinates = Literal["fitted", "given"]
 
 log = logging.getLogger(__name__)
 
 
 def check_extent(
-    space: str, near: float | None, far: float | None, frame: str = "fitted", aabb_half: float | None = None
+    space: str, near: float | None, far: float | None, coordinates: str = "fitted", aabb_half: float | None = None
 ) -> None:
-    """Refuse a space or frame that there is none of, distances between which nothing lies, and a box of no size."""
-    require_one_of(get_args(Frame), **{"scene.frame": frame})
+    """Refuse a space or coordinates that do not exist, distances between which nothing lies, and a box of no size."""
+    require_one_of(get_args(Coordinates), **{"scene.coordinates": coordinates})
     if space not in get_args(Spaces):
         raise InputError(f"scene.space={space!r}: choose one of {', '.join(get_args(Spaces))}.")
-    if frame == "given" and space == "ndc":
-        raise InputError("scene.space=ndc has a frame of its own. Use scene.frame=fitted, or another scene.space.")
+    if coordinates == "given" and space == "ndc":
+        raise InputError(
+            "scene.space=ndc has coordinates of its own. Use scene.coordinates=fitted, or another scene.space."
+        )
     if not 0.0 <= (near or 0.0) < (FARTHEST if far is None else far) <= FARTHEST:
         raise InputError(
             f"scene.near={near} and scene.far={far}: rays need 0 <= near < far <= {FARTHEST:g}, in the capture's units."
@@ -48,7 +50,7 @@ def scene_of(
     background: Background,
     protocol: dict[str, str],
     metres_per_unit: float | None = None,
-    frame: Frame = "fitted",
+    coordinates: Coordinates = "fitted",
     aabb_half: float | None = None,
 ) -> Scene:
     """Return a capture as a scene, in its own frame or in a working frame: upright, centered, of a handy size.
@@ -65,15 +67,15 @@ def scene_of(
         background: what lies behind the scene.
         protocol: how the pixels were made.
         metres_per_unit: how many meters a unit of the user's frame is long; None: unknown.
-        frame: given: the capture's own frame is kept, with near, far and the box that are given.
-        aabb_half: half the side of the box around the origin, for a frame that is given; None: the capture's box.
+        coordinates: given: the capture's own frame is kept, with near, far and the box that are given.
+        aabb_half: half the side of the box around the origin, for coordinates that are given; None: the capture's box.
 
     Raises:
         InputError: cameras and content that leave no room for a scene.
     """
     names = tuple(view.name for view in capture.views)
     chosen: Space
-    if frame == "given":
+    if coordinates == "given":
         chosen = "contracted" if space == "contracted" else "bounded"
         extent, c2w = given_extent(capture, near, far, aabb_half), cameras.c2w
     else:

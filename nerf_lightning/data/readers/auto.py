@@ -12,7 +12,8 @@ from typing import Any, Literal
 import yaml
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.reader import CaptureReader, located, require_one
+from nerf_lightning.data.captures.folders import located, named_folder, require_one
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
@@ -85,7 +86,7 @@ class AutoReader(CaptureReader):
 
     def folder(self) -> Path:
         """Return the folder that the user named."""
-        return self.named_folder()
+        return named_folder(self.root)
 
     def capture(self) -> Capture:
         """Return what the format says."""

@@ -8,9 +8,10 @@ from typing import ClassVar
 
 from nerf_lightning.data.captures.capture import Capture, of_one_lens
 from nerf_lightning.data.captures.checks import check_step
+from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.captures.scene import Frame
+from nerf_lightning.data.captures.scene import Coordinates
 from nerf_lightning.data.captures.splits import apart
 from nerf_lightning.data.pixels.decoding import upright_size
 from nerf_lightning.data.pixels.images import ENDINGS
@@ -36,7 +37,7 @@ class BlenderReader(CaptureReader):
     behind: ClassVar[Background] = "white"
 
     name: str = "blender"
-    frame: Frame = "given"
+    coordinates: Coordinates = "given"
     near: float | None = 2.0
     far: float | None = 6.0
     aabb_half: float | None = 1.5
@@ -50,7 +51,7 @@ class BlenderReader(CaptureReader):
 
     def folder(self) -> Path:
         """Return the capture's folder; where `root` has the files, what their pictures look like does not matter."""
-        named = self.named_folder()
+        named = named_folder(self.root)
         return named if _file_of(named, "train") else super().folder()
 
     def check_settings(self) -> None:

@@ -10,9 +10,10 @@ from jaxtyping import Shaped, UInt8
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.captures.scene import Frame
+from nerf_lightning.data.captures.scene import Coordinates
 from nerf_lightning.data.captures.splits import in_order
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import PictureHeader
@@ -63,7 +64,7 @@ class NpzReader(CaptureReader):
 
     root: str = ""
     name: str = "npz"
-    frame: Frame = "given"
+    coordinates: Coordinates = "given"
     near: float | None = 2.0
     far: float | None = 6.0
     aabb_half: float | None = 1.5
@@ -86,7 +87,7 @@ class NpzReader(CaptureReader):
 
     def folder(self) -> Path:
         """Return the folder of the file."""
-        return self.named_folder()
+        return named_folder(self.root)
 
     def capture(self) -> Capture:
         """Return the views, of a file that is downloaded first if it is absent and an address is given."""

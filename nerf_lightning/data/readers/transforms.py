@@ -12,9 +12,10 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.readers.frames import (
     FoundFrame,
     FrameFile,
@@ -90,7 +91,7 @@ class TransformsReader(CaptureReader):
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()
         if self.file is not None:  # it may lie in a folder that is a capture itself
-            places = [folder / self.file for folder in (self.named_folder(), self.folder())]
+            places = [folder / self.file for folder in (named_folder(self.root), self.folder())]
             return [next(filter(os.path.isfile, places), places[0])]
         if os.path.isfile(root):
             return [root]
@@ -106,8 +107,7 @@ class TransformsReader(CaptureReader):
         if folder == root or not folder.is_relative_to(root):
             return ()
         named = {view.photograph.path for view in views} | {folder / Path(name).name for name in left_out.faults}
-        base = folder.relative_to(root)
-        return tuple((base / name).as_posix() for name in picture_files(folder) if folder / name not in named)
+        return tuple(path.relative_to(root).as_posix() for path in pictures_below(folder) if path not in named)
 
     def _with_masks_and_depths(self, path: Path, found: list[FoundFrame], scale: float) -> list[View]:
         """Return the views with the files that frames name beside their pictures.

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order, pictures_below
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import read_header
 from nerf_lightning.files.budgets import require_within
@@ -53,7 +53,7 @@ class NeusReader(CaptureReader):
         path = root / (self.found_in(root) or FILES[0])
         world, scale = _matrices(path)
         folder = first_with_pictures(root, [self.images] if self.images else PICTURE_FOLDERS) or root
-        names = picture_files(folder)
+        names = [path.relative_to(folder).as_posix() for path in pictures_below(folder)]
         if len(names) != len(world):
             raise InputError(
                 f"{path} has {len(world)} cameras, but {folder} has {len(names)} photographs, and both are paired in "

@@ -113,7 +113,7 @@ def test_a_missing_split_is_the_other_else_views_are_held_out(root, caplog, abse
 
 
 def test_the_frame_may_be_fitted_to_the_cameras_instead(root):
-    given, fitted = (BlenderReader(str(root), frame=frame).read() for frame in ("given", "fitted"))
+    given, fitted = (BlenderReader(str(root), coordinates=each).read() for each in ("given", "fitted"))
     here, there = (scene.cameras.c2w[:, :, 3].double() for scene in (given, fitted))
     assert float(there.norm(dim=-1).max()) < 2.0 < float(here.norm(dim=-1).max())
     assert torch.allclose(points_to_user(there, fitted.to_user), here, atol=1e-5)

@@ -37,8 +37,11 @@ FRAME = {"file_path": "train/r_0", "transform_matrix": pose(0)}
         ({"far": float("nan")}, r"rays need 0 <= near < far"),
         ({"background": "pink"}, r"background is 'pink'; choose one of white, black, random, white_or_random"),
         ({"aabb_half": 0.0}, r"scene.aabb_half=0.0"),
-        ({"space": "ndc"}, r"scene.space=ndc has a frame of its own. Use scene.frame=fitted"),
-        ({"aabb_half": None}, r"scene.frame=given needs .*train.json does not give them. Set scene.near, .*aabb_half"),
+        ({"space": "ndc"}, r"scene.space=ndc has coordinates of its own. Use scene.coordinates=fitted"),
+        (
+            {"aabb_half": None},
+            r"scene.coordinates=given needs .*train.json does not give them. Set scene.near, .*aabb_half",
+        ),
     ],
 )
 def test_refuses_settings(root, settings, message):

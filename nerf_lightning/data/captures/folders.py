@@ -1,0 +1,78 @@
+"""Which folder a capture lies in: the one that the user named, one below it, or the one that it is a part of."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
+from nerf_lightning.files.regular import what_is
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
+
+PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "train")
+"""Folders within a capture, whose parent is meant where one of them is given."""
+DEEPEST, MOST_FOLDERS = 3, 1000
+"""How far below a folder, and in how many folders of a level, captures are looked for."""
+
+Found = TypeVar("Found")
+
+
+def named_folder(root: str) -> Path:
+    """Return the folder that the user named, or the one of the file; `InputError` says that there is none."""
+    try:
+        folder = Path(root).expanduser()
+    except RuntimeError as error:
+        raise InputError(f"scene.root={root}: {error}. Give the folder without ~.") from error
+    if os.path.isfile(folder):
+        return folder.parent
+    if not os.path.isdir(folder):
+        where = (
+            ""
+            if folder.is_absolute() or os.path.lexists(folder)
+            else f" in {Path.cwd()}, where relative ones are looked for"
+        )
+        raise InputError(f"The folder {folder} {what_is(folder)}{where}. Set scene.root to the capture's folder.")
+    return folder
+
+
+def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:
+    """Return what a folder holds, as a list of one; or the capture that it is a part of, or those that lie below it.
+
+    Args:
+        folder: as the user named it.
+        capture_in: returns what a folder itself holds, None where it holds no capture.
+    """
+
+    def near(path: Path) -> Found | None:
+        try:
+            return capture_in(path)
+        except (OSError, InputError):  # it is not the user's
+            return None
+
+    known, part = capture_in(folder), folder.resolve()
+    if known and (part.name not in PARTS or pictures_below(folder)):
+        return [known]
+    while part.name in PARTS:
+        part = part.parent
+        if whole := near(part):
+            return [whole]
+    found, below = [known] if known else [], [folder]
+    for _ in range(0 if found else DEEPEST):
+        below = [path for each in below for path in _folders_in(each)][:MOST_FOLDERS]
+        found = found or [known for path in below if (known := near(path))]
+    return found
+
+
+def require_one(folders: Sequence[Path], root: str) -> None:
+    """Refuse a folder `root` that holds several captures."""
+    if len(folders) > 1:
+        choice = listed((f"scene.root={path}" for path in folders), 4)
+        raise InputError(f"{root} holds {len(folders)} captures. Choose one of them: {choice}.")
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_dir())
+    except OSError:  # may not be listed
+        return []

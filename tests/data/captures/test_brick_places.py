@@ -1,0 +1,102 @@
+"""From a capture to near, far, space, the doctor's verdict and a film, in places whose distances are known."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from support.brick_places import Place, corridor, heap, outward_ring
+
+from nerf_lightning.doctor.conventions import FLIP_YZ, axes
+from nerf_lightning.doctor.examine import examine
+from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.video.paths.auto import AutoPath
+from nerf_lightning.video.paths.base import frame_of
+
+PLACES = {"heap": heap, "ring": lambda: outward_ring(1.0), "corridor": corridor}
+OUTWARD = {"narrow": (0.4, 1, "transforms"), "wide": (1.0, 2, "llff"), "close to the bricks": (2.0, 3, "colmap")}
+"""Radius, seed and format."""
+WALKS = {"straight": (0.0, 0.0, 4, "colmap"), "bent": (60.0, 0.0, 5, "llff"), "glancing": (0.0, 25.0, 6, "transforms")}
+"""Bend, glance, seed and format."""
+
+
+def assert_reaches_the_bricks(scene: Scene, place: Place, unit: float = 1.0) -> None:
+    """All of space is modeled, near and far hold what is seen, and near is not next to nothing."""
+    assert scene.space == "contracted"
+    distance = torch.from_numpy(place.distance) / (unit * unit_of(scene.to_user))
+    seen = distance.isfinite()
+    assert bool((scene.near[:, None] < distance)[seen].all())
+    assert bool((distance < scene.far[:, None])[seen].all())
+    assert float(scene.near.min()) > 0.01 * float(distance.min())
+
+
+def assert_filmed_as_photographed(scene: Scene) -> None:
+    """Every frame looks about where a photograph looks, and its rows are level in the capture's own frame."""
+    frame = frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names)
+    film = AutoPath(60).cameras(frame).c2w
+    turned = (film[:, :, 2] @ frame.poses[:, :, 2].mT).amax(dim=1).clamp(max=1.0).acos().rad2deg()
+    assert float(turned.max()) < 25
+    to_user = scene.to_user[:3, :3] / unit_of(scene.to_user)
+    right, up = (to_user @ film[:, :, column].double().mT for column in (0, 1))
+    assert float(right[2].abs().max()) < math.sin(math.radians(15))
+    assert float(up[2].min()) > 0
+
+
+def verdicts(scene: Scene) -> dict[str, str]:
+    """Return what the doctor says, where it says more than ok."""
+    return {check.name: check.verdict for check in examine(scene)[1] if check.verdict in ("look", "wrong")}
+
+
+@pytest.mark.parametrize(("around", "seed", "kind"), [(360, 0, "transforms"), (240, 1, "colmap"), (150, 2, "llff")])
+def test_seven_cameras_that_were_moved_away(tmp_path, around, seed, kind):
+    moved = torch.randperm(30, generator=torch.Generator().manual_seed(seed))[:7].tolist()
+    place = heap(around, 30, seed).with_cameras_moved(moved, 20.0)
+    scene = place.read(kind, tmp_path / "capture")
+    assert_reaches_the_bricks(scene, place)
+    # The unit is that of the other cameras.
+    kept = sorted({*range(30)} - {*moved})
+    assert 0.3 < float(scene.cameras.c2w[kept, :, 3].norm(dim=-1).median()) < 1.0
+    assert_filmed_as_photographed(scene)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+@pytest.mark.parametrize("name", PLACES)
+def test_a_capture_in_millimeters_is_the_one_in_meters(tmp_path, name, kind):
+    place = PLACES[name]()
+    meters = place.read(kind, tmp_path / "meters")
+    scene = place.read(kind, tmp_path / "millimeters", unit=1e-3, origin=(4e5, -7e4, 300.0))
+    assert_reaches_the_bricks(scene, place, unit=1e-3)
+    assert unit_of(scene.to_user) == pytest.approx(1000 * unit_of(meters.to_user), rel=1e-5)
+    torch.testing.assert_close(scene.near, meters.near, rtol=1e-3, atol=0)
+    torch.testing.assert_close(scene.far, meters.far, rtol=1e-3, atol=0)
+    torch.testing.assert_close(scene.cameras.c2w, meters.cameras.c2w, rtol=0, atol=1e-3)
+    assert_filmed_as_photographed(scene)
+    if kind == "transforms":
+        assert "wrong" not in verdicts(scene).values()
+
+
+@pytest.mark.parametrize(("bend", "glance", "seed", "kind"), WALKS.values(), ids=WALKS)
+def test_a_walk_ahead_through_a_corridor(tmp_path, bend, glance, seed, kind):
+    place = corridor(bend, glance, seed=seed)
+    scene = place.read(kind, tmp_path / "capture")
+    assert_reaches_the_bricks(scene, place)
+    assert_filmed_as_photographed(scene)
+    assert "wrong" not in verdicts(scene).values()
+
+
+@pytest.mark.parametrize(("radius", "seed", "kind"), OUTWARD.values(), ids=OUTWARD)
+def test_a_ring_of_cameras_that_look_outward(tmp_path, radius, seed, kind):
+    place = outward_ring(radius, seed=seed)
+    scene = place.read(kind, tmp_path / "capture")
+    assert_reaches_the_bricks(scene, place)
+    assert_filmed_as_photographed(scene)
+    found = verdicts(scene)
+    assert "wrong" not in found.values(), found
+    assert found["common middle"] == "look"
+
+
+def test_cameras_around_a_heap_whose_axes_are_others_are_wrong(tmp_path):
+    scene = heap().read("transforms", tmp_path / "capture")
+    flipped = replace(scene, cameras=replace(scene.cameras, c2w=axes(scene.cameras.c2w, FLIP_YZ)))
+    assert verdicts(flipped)["common middle"] == "wrong"
