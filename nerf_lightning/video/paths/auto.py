@@ -14,6 +14,7 @@ from nerf_lightning.video.paths.sweep import Sweep
 from nerf_lightning.video.paths.walk import Walk
 
 FACING = 0.7  # Least cosine between where most photographs look and the center.
+BEYOND = 0.05  # Of the photographs, how many may have the center behind them.
 
 
 @final
@@ -45,11 +46,15 @@ class AutoPath(CameraPath):
 
 @disable_autocast
 def looks_at_center(around: PathFrame) -> bool:
-    """Tell whether most photographs show the center, seen from different sides; forward-facing captures have none."""
+    """Return whether most photographs show the center, seen from different sides; forward-facing captures have none.
+
+    Nor has a walk along a street, where some photographs were taken beyond what the others look at.
+    """
     if around.forward_facing:
         return False
     offsets = normalize(around.poses[:, :, 3] - around.center, dim=-1)
-    return float((offsets * around.poses[:, :, 2]).sum(dim=-1).median()) > FACING
+    cosines = (offsets * around.poses[:, :, 2]).sum(dim=-1)
+    return float(cosines.median()) > FACING and float((cosines < 0.0).float().mean()) <= BEYOND
 
 
 @disable_autocast

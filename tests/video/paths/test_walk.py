@@ -87,6 +87,12 @@ def test_cameras_that_look_straight_down_keep_their_own_up():
     torch.testing.assert_close(seen[:, :, 1], north.expand(20, 3), atol=1e-6, rtol=0)
 
 
+def test_a_street_is_walked_also_where_most_photographs_look_at_a_place_on_the_way():
+    """The last ones were taken beyond it."""
+    around = replace(street(), center=torch.tensor([16.5, 0.0, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(AutoPath(7).cameras(around).c2w, Walk(7).cameras(around).c2w)
+
+
 def test_photographs_side_by_side_are_seen_from_a_spiral_and_one_alone_stands_still():
     place = torch.arange(9, dtype=torch.float64)
     eyes = torch.stack([torch.zeros(9), place % 3, place // 3], dim=-1)
