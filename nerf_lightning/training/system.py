@@ -22,7 +22,7 @@ from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
-from nerf_lightning.training.launch.fitting import length_of_run
+from nerf_lightning.training.launch.fitting import length_of_run, require_fitting
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.resume import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
@@ -69,6 +69,16 @@ class RadianceFieldSystem(LightningModule):
         checkpoint = read_checkpoint(checkpoint_path)
         return cls(rendering_step(checkpoint, trust), checkpoint.record).to(map_location or "cpu").eval()
 
+    def configure_callbacks(self) -> list[Any]:
+        """Return none; Lightning asks before it looks at its own settings, so what cannot be is refused here.
+
+        Raises:
+            InputError: the trainer cannot fit this system.
+        """
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            require_fitting(self.trainer)
+        return []
+
     def configure_optimizers(self) -> Optimizer:
         """Return the step's optimizer.
 
@@ -81,7 +91,7 @@ class RadianceFieldSystem(LightningModule):
         """Take the length of the run from the trainer, and record its steps where that was asked for and is possible.
 
         Raises:
-            InputError: it has none, the trainer cannot fit this system, or its steps cannot be recorded.
+            InputError: it has none, or its steps cannot be recorded.
         """
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
         self.step.begin_recording()

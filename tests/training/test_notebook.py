@@ -11,8 +11,9 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.initialize import initialize_config_dir
 from lightning import Callback, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateFinder, ModelCheckpoint, ModelPruning
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from support.captures import write_npz
 from support.configs import composed, options
 from support.learnt_cameras import LearntShifts
@@ -202,6 +203,11 @@ def test_lightnings_look_before_training_is_no_validation(run, trainer, tmp_path
         ({"precision": "bf16-mixed"}, ("precision=bf16-mixed", "trainer.precision=bf16-mixed")),
         ({"precision": "64-true"}, ("precision=64-true", "32-true, tf32, bf16-mixed")),
         ({"overfit_batches": 1}, ("overfit_batches=1", "scene.frames")),
+        ({"gradient_clip_val": 0.5}, ("gradient_clip_val=0.5", "trainer.clip_norm=0.5")),
+        ({"accumulate_grad_batches": 2}, ("accumulate_grad_batches", "data.batch_rays")),
+        ({"callbacks": [BatchSizeFinder()]}, ("BatchSizeFinder", "data.batch_rays")),
+        ({"callbacks": [LearningRateFinder()]}, ("LearningRateFinder", "optimizer.lr")),
+        ({"callbacks": [ModelPruning("l1_unstructured", amount=0.1)]}, ("ModelPruning", "model=fast_small")),
     ],
 )
 def test_what_would_be_computed_otherwise_than_it_says_is_refused(run, trainer, settings, parts):
@@ -209,6 +215,21 @@ def test_what_would_be_computed_otherwise_than_it_says_is_refused(run, trainer, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         refused(trainer(max_steps=2, **settings).fit, one.system, one.data, parts=parts)
+
+
+def test_what_a_gpu_sums_in_any_order_is_not_called_deterministic(run, trainer, monkeypatch):
+    monkeypatch.setattr(SingleDeviceStrategy, "root_device", torch.device("cuda"))
+    try:
+        one, fit = run(*FAST_PATH), trainer(max_steps=2, deterministic=True)
+        refused(fit.fit, one.system, one.data, parts=("deterministic=True", "model=nerf"))
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def test_a_run_that_a_clock_ends_is_warned_of_its_learning_rate(run, trainer, caplog):
+    one = run()
+    trainer(max_steps=2, max_time={"seconds": 600}).fit(one.system, one.data)
+    assert "budget.seconds=N" in caplog.text
 
 
 @pytest.mark.parametrize("settings", [(), FAST_PATH])

@@ -1,14 +1,22 @@
 """What a system takes from the trainer that fits it, ours or Lightning's own: the run's length; and what it refuses."""
 
+import logging
 import math
+from typing import Any
 
+import torch
 from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateFinder, ModelPruning, Timer
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 
 from nerf_lightning.checkpoints.format import PRECISIONS
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.launch.strategy import OneSumPerStep
+
+log = logging.getLogger(__name__)
 
 
 def length_of_run(trainer: Trainer, progress: Progress) -> int:
@@ -21,8 +29,8 @@ def length_of_run(trainer: Trainer, progress: Progress) -> int:
     Raises:
         InputError: the run has no end, begins where no run begins, or the trainer would compute something else.
     """
-    _require_plain(trainer)
     _require_beginning(trainer, progress)
+    _warn_of_timer(trainer)
     trainer.fit_loop.setup_data()  # the number below would ask for it, and say so in the log
     steps = trainer.estimated_stepping_batches
     if math.isinf(steps):
@@ -48,23 +56,82 @@ def _require_beginning(trainer: Trainer, progress: Progress) -> None:
         )
 
 
-def _require_plain(trainer: Trainer) -> None:
-    """Refuse what Lightning's Trainer would do to a step that does it by itself, or that no step follows."""
-    if trainer.precision != "32-true":
-        known = ", ".join(PRECISIONS)
-        ours = trainer.precision if trainer.precision in PRECISIONS else f"... (one of {known})"
-        raise InputError(
+def require_fitting(trainer: Trainer) -> None:
+    """Refuse a trainer that would do to a step what the step does by itself, or what no step follows.
+
+    Raises:
+        InputError: with what to set instead.
+    """
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]
+    ours = trainer.precision if trainer.precision in PRECISIONS else f"... (one of {', '.join(PRECISIONS)})"
+    again, clip = trainer.overfit_batches, trainer.gradient_clip_val  # type: ignore[attr-defined]
+    for refused, words in (
+        (
+            trainer.precision != "32-true",
             f"Trainer(precision={trainer.precision}) would lower cameras and quadrature too: leave it out, and give "
-            f"build_run trainer.precision={ours}, which is for the fields alone."
-        )
-    if trainer.world_size > 1 and not isinstance(trainer.strategy, OneSumPerStep):
-        raise InputError(
+            f"build_run trainer.precision={ours}, which is for the fields alone.",
+        ),
+        (
+            not isinstance(trainer.strategy, SingleDeviceStrategy | DDPStrategy),
+            f"{type(trainer.strategy).__name__} divides weights among devices, and a step needs all of them. Leave "
+            "Trainer(strategy=...) out, or use nerf train trainer=ddp for several devices.",
+        ),
+        (
+            trainer.world_size > 1 and not isinstance(trainer.strategy, OneSumPerStep),
             "With several devices Lightning's Trainer would add up gradients in each tile of a step. Use nerf train "
-            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.strategy."
-        )
-    again = trainer.overfit_batches  # type: ignore[attr-defined]
-    if again:
-        raise InputError(
+            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.strategy.",
+        ),
+        (
+            again,
             f"Trainer(overfit_batches={again}) has no effect on rays, of which each step sees others. To learn few "
-            "views, give build_run scene.frames."
+            "views, give build_run scene.frames.",
+        ),
+        (
+            clip,
+            f"Trainer(gradient_clip_val={clip}) would clip each tile of a step. Leave it out, and give build_run "
+            f"trainer.clip_norm={clip}.",
+        ),
+        (
+            trainer.accumulate_grad_batches != 1,
+            "A step already adds up the gradients of its tiles. Leave Trainer(accumulate_grad_batches=...) out, and "
+            "give build_run a larger data.batch_rays.",
+        ),
+        (
+            _has(callbacks, BatchSizeFinder),
+            "BatchSizeFinder finds no batch size: a batch is rays, cut into tiles that fit the memory. Leave it out, "
+            "and give build_run data.batch_rays.",
+        ),
+        (
+            _has(callbacks, LearningRateFinder),
+            "LearningRateFinder takes steps that a run would count. Leave it out, and give build_run optimizer.lr.",
+        ),
+        (
+            _has(callbacks, ModelPruning),
+            "ModelPruning replaces the weights that the step and its kernels hold. Leave it out; a smaller model is "
+            "model=fast_small or field.width.",
+        ),
+        (
+            torch.are_deterministic_algorithms_enabled()
+            and trainer.strategy.root_device.type == "cuda"
+            and any(isinstance(part, HashGridEncoder) for part in trainer.lightning_module.modules()),
+            "Trainer(deterministic=True) cannot be kept: on a GPU the gradients of hash grids are sums by atomic "
+            "additions, whose order varies. Leave it out, train on a CPU, or choose a model without hash grids, such "
+            "as model=nerf.",
+        ),
+    ):
+        if refused:
+            raise InputError(words)
+
+
+def _has(callbacks: list[Any], kind: type) -> bool:
+    return any(isinstance(each, kind) for each in callbacks)
+
+
+def _warn_of_timer(trainer: Trainer) -> None:
+    """Say that a run that is ended by Lightning's clock may end with a high learning rate."""
+    if _has(trainer.callbacks, Timer):  # type: ignore[attr-defined]
+        log.warning(
+            "Lightning's Timer (max_time) may end this run before its %d steps, and with the learning rate still high. "
+            "Give max_steps that fit the time, or use nerf train budget.seconds=N, whose rate follows the time.",
+            trainer.max_steps,
         )
