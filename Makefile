@@ -136,7 +136,7 @@ bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
 	@$(VENV)/bin/python tests/soak.py $(SECONDS)
 
-doctor-rates: setup ## How often each check of the doctor raises a false alarm, over SEEDS captures of 8 kinds; ten minutes
+doctor-rates: setup ## How often each check of the doctor raises a false alarm, over SEEDS captures of 8 kinds; 40 minutes for SEEDS=8
 	@$(VENV)/bin/python tests/doctor_rates.py $(SEEDS)
 
 fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each time

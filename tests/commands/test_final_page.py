@@ -66,7 +66,8 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     assert seen["beside"].keyframes[-1]["time"] == pytest.approx(10.0)
 
 
-FLAT, RISING = [20.0] * 40 + [25.0] * 60, [20.0 + 0.1 * row for row in range(100)]
+FLAT, RISING = [20.0] * 40 + [25.0] * 60, [15.0 + 0.1 * row for row in range(100)]
+MEMORIZED = [5.0 + value for value in RISING]  # the training views alone
 
 
 @pytest.mark.parametrize(
@@ -75,6 +76,7 @@ FLAT, RISING = [20.0] * 40 + [25.0] * 60, [20.0 + 0.1 * row for row in range(100
         (43, FLAT, "train longer (nerf train resume=run budget.seconds=300)."),
         (4000, RISING, "train longer (nerf train resume=run budget.seconds=300)."),
         (4000, FLAT, "Take 6 more photographs."),
+        (4000, MEMORIZED, "Take 6 more photographs."),
     ],
 )
 def test_longer_training_is_advised_before_more_photographs_while_it_helps(monkeypatch, steps, curve, cure):

@@ -42,6 +42,7 @@ MOST_VIDEO_BYTES = 20_000_000  # Of a film in the page that follows a training
 # Of photographs: 92 steps made 21.6 dB of 16 of them, and 1,018 made 27.8.
 FEW_STEPS = 1_000
 RISING = 1.5  # dB of training PSNR in the second half of a run
+MEMORIZED = 6.0  # dB between training and held-out views, beyond which only more photographs help
 
 log = logging.getLogger(__name__)
 
@@ -82,13 +83,13 @@ def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
         f"trainer.max_steps={2 * steps}" if seconds is None else f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
     )
     cure = f"train longer ({resume_command(page.parent)} {length})."
-    if not _still_learns(job, page.parent, steps):
+    if not _still_learns(job, page.parent, psnr, steps):
         cure = advice(job.checks or ()) or f"the {what} are fine; {cure}"
     return f"result       {page}: {quality}{used} of {total} {what} used. To improve it: {cure}"
 
 
-def _still_learns(job: TrainJob, folder: Path, steps: int) -> bool:
-    """Return whether more steps would help first: after few of them, or while the training error falls fast."""
+def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> bool:
+    """Return whether more steps would help first: after few of them, or while the error falls fast, of all views."""
     if steps < FEW_STEPS:
         return True
     try:
@@ -96,7 +97,10 @@ def _still_learns(job: TrainJob, folder: Path, steps: int) -> bool:
     except (InputError, KeyError):  # no such logger
         return False
     tenth = len(values) // 10
-    return tenth > 0 and fmean(values[-tenth:]) - fmean(values[4 * tenth : 5 * tenth]) > RISING
+    if tenth == 0:
+        return False
+    reached, before = fmean(values[-tenth:]), fmean(values[4 * tenth : 5 * tenth])
+    return reached - before > RISING and (psnr is None or reached - psnr < MEMORIZED)
 
 
 def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None:
