@@ -289,7 +289,7 @@ def test_what_a_killed_process_left_in_the_cache_is_replaced(tmp_path: Path) -> 
     (path,) = tmp_path.glob("*.npz")
     sound = path.read_bytes()
     path.rename(path.with_name(f".{path.stem}.999999999_{MACHINE}.nerf_lightning.part.npz"))  # killed before that
-    atomic._sweep.cache_clear()
+    atomic.remove_leftovers.cache_clear()
     small.read()
     assert path.read_bytes() == sound
     assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".lock"}

@@ -212,7 +212,7 @@ def test_a_failed_reader_leaves_nothing_and_a_killed_one_nothing_that_is_believe
     store = read(capture, cache)
     (path,) = cache.glob("*.pixels")
     path.rename(path.with_name(f".{path.stem}.999999999_{MACHINE}.nerf_lightning.part.pixels"))  # killed before that
-    atomic._sweep.cache_clear()
+    atomic.remove_leftovers.cache_clear()
     assert np.array_equal(read(capture, cache).rgba, store.rgba)
     assert not list(cache.glob("*.part*"))
 
