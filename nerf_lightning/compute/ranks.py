@@ -5,6 +5,7 @@ on its share of the same global batch, and whatever one of them decides by, all 
 """
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -57,10 +58,20 @@ def every_other(items: Sequence[Item]) -> Sequence[Item]:
 
 
 def add_up(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over the ranks; all ranks get the same bits."""
-    if world_size() > 1:
-        for pending in [distributed.all_reduce(tensor, async_op=True) for tensor in tensors]:
-            pending.wait()
+    """Replace each tensor by its sum over the ranks; all ranks get the same bits.
+
+    Those of one type travel together: a message costs more than most tensors' bytes.
+    """
+    if world_size() == 1:
+        return
+    kinds = defaultdict[tuple[torch.dtype, torch.device], list[Tensor]](list)
+    for tensor in tensors:
+        kinds[tensor.dtype, tensor.device].append(tensor)
+    for several in kinds.values():
+        sums = torch.cat([tensor.flatten() for tensor in several])
+        distributed.all_reduce(sums)
+        for tensor, part in zip(several, sums.split([tensor.numel() for tensor in several]), strict=True):
+            tensor.copy_(part.view_as(tensor))
 
 
 def add_up_gradients(parameters: Iterable[nn.Parameter]) -> None:
