@@ -21,6 +21,9 @@ OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs se
 NEAREST, FARTHEST = 0.1, 0.9
 """Quantiles of the photographs' distances: nearer, content leaves the picture; from farther away one sees what no
 photograph shows."""
+STRAY = (
+    3.0  # Times the median distance, beyond which a photograph's place is taken for a mistake of the reconstruction.
+)
 HIGHEST = 80.0  # Degrees; straight above the content a picture has no up.
 MIDDLE, FRAMED = 2 / 3, 0.95
 """Of the picture's width and height, and of the content that every frame shows there."""
@@ -52,8 +55,10 @@ class Sweep(CameraPath):
         """Return the cameras of the loop; the last frame precedes the first."""
         up, east, north = level_axes(around.up)
         offsets = around.poses[:, :, 3] - around.center
-        taken = torch.atan2(offsets @ north, offsets @ east).rad2deg()
         distances = offsets.norm(dim=-1).clamp(min=1e-6)
+        near = distances <= STRAY * distances.median()
+        axes, offsets, distances = -around.poses[near, :, 2], offsets[near], distances[near]
+        taken = torch.atan2(offsets @ north, offsets @ east).rad2deg()
         heights = (offsets @ up / distances).clamp(-1.0, 1.0).asin().rad2deg()
 
         azimuth = azimuths(taken, self.num_frames)
@@ -70,7 +75,6 @@ class Sweep(CameraPath):
             farthest = math.inf if around.bounded else float(torch.quantile(distances, FARTHEST))
             return step_back(cameras, content, (farthest - distance).clamp(min=0.0))
         # Aimed as those nearby, of whose axes this is the point nearest to the center.
-        axes = -around.poses[:, :, 2]
         aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
         return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)
 
