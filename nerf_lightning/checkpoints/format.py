@@ -60,6 +60,8 @@ TRAINING: dict[str, Any] = {
 """What training goes on from, beside the record; the run that does holds it against its own (`training/resume.py`)."""
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
+OF_AVERAGING: dict[str, Any] = {"current_model_state": dict[str, Tensor], "averaging_state": dict[str, Tensor]}
+"""What Lightning's WeightAveraging adds and restores; `state_dict` has the averages then."""
 
 
 def require_checkpoint(content: dict[str, Any], where: str) -> None:
@@ -69,7 +71,7 @@ def require_checkpoint(content: dict[str, Any], where: str) -> None:
         Mismatch: the first key that is missing, unknown, or not what it must be.
         InputError: more than the budgets allow.
     """
-    require_fit(content, FILE, "", TRAINING | OF_SUBCLASSES)
+    require_fit(content, FILE, "", TRAINING | OF_SUBCLASSES | OF_AVERAGING)
     for name in content["state_dict"]:
         if not name.startswith(PARTS):
             raise Mismatch(f"state_dict.{name}", "belongs to no part of a run")

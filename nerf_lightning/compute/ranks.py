@@ -15,6 +15,8 @@ from torch import Tensor, distributed, nn
 from nerf_lightning.messages.errors import InputError
 
 Item = TypeVar("Item")
+LARGE = 1 << 19
+"""Numbers of a tensor, beyond which it is sent by itself."""
 
 
 def world_size() -> int:
@@ -60,18 +62,24 @@ def every_other(items: Sequence[Item]) -> Sequence[Item]:
 def add_up(tensors: Iterable[Tensor]) -> None:
     """Replace each tensor by its sum over the ranks; all ranks get the same bits.
 
-    Those of one type travel together: a message costs more than most tensors' bytes.
+    Small ones of one type travel in one message, which costs more than their bytes; a copy of a large one would cost
+    more than a message.
     """
     if world_size() == 1:
         return
-    kinds = defaultdict[tuple[torch.dtype, torch.device], list[Tensor]](list)
+    pending, kinds = [], defaultdict[tuple[torch.dtype, torch.device], list[Tensor]](list)
     for tensor in tensors:
-        kinds[tensor.dtype, tensor.device].append(tensor)
+        if tensor.numel() > LARGE:
+            pending.append(distributed.all_reduce(tensor, async_op=True))
+        else:
+            kinds[tensor.dtype, tensor.device].append(tensor)
     for several in kinds.values():
         sums = torch.cat([tensor.flatten() for tensor in several])
         distributed.all_reduce(sums)
         for tensor, part in zip(several, sums.split([tensor.numel() for tensor in several]), strict=True):
             tensor.copy_(part.view_as(tensor))
+    for message in pending:
+        message.wait()
 
 
 def add_up_gradients(parameters: Iterable[nn.Parameter]) -> None:

@@ -20,6 +20,7 @@ from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.launch import xla
+from nerf_lightning.training.launch.fitting import require_deterministic
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
@@ -63,6 +64,8 @@ def build_step(
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
+    if settings.deterministic:
+        require_deterministic(model, settings.device_type)
     hold_to_budgets(model, "The model")
     if settings.device_type == "cpu":
         taken = model.kernels()

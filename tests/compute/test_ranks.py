@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.scenes import ball_scene
 from support.steps import gradients, make_step
+from support.two_processes import in_two_processes
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import RayBatches
@@ -44,3 +45,29 @@ def test_the_shares_of_a_step_add_up_to_the_step(monkeypatch, world):
         total, total_losses = total + part, total_losses + part_losses
     assert torch.allclose(total, whole, atol=1e-6)
     assert torch.allclose(total_losses, losses, rtol=1e-5)
+
+
+SUMS = """
+from nerf_lightning.compute import ranks
+random = torch.Generator().manual_seed(rank)
+shapes = [(3,), (), (5, 7), (0,), (ranks.LARGE + 1,), (2, 3)]
+parameters = [torch.nn.Parameter(torch.zeros(shape)) for shape in shapes]
+for parameter in parameters[1:]:
+    parameter.grad = torch.randn(parameter.shape, generator=random)
+parameters[2].grad = torch.randn(7, 5, generator=random).mT
+counts = torch.tensor([rank, 2])
+own = [torch.zeros(3), *(parameter.grad.clone() for parameter in parameters[1:]), counts.clone()]
+messages, reduce = [], distributed.all_reduce
+distributed.all_reduce = lambda tensor, **how: (messages.append(tensor.numel()), reduce(tensor, **how))[1]
+ranks.add_up_gradients(parameters)
+ranks.add_up([counts])
+result = own, [*(parameter.grad for parameter in parameters), counts], messages
+"""
+
+
+def test_two_processes_have_the_same_sums_in_a_message_for_all_small_tensors_of_a_type(tmp_path):
+    (one, sums, messages), (other, same, _) = in_two_processes(SUMS, tmp_path)
+    assert messages == [ranks.LARGE + 1, 3 + 1 + 35 + 6, 2]
+    for added, again, left, right in zip(sums, same, one, other, strict=True):
+        assert torch.equal(added, left + right)
+        assert torch.equal(added, again)

@@ -63,7 +63,7 @@ def steps_on_tape() -> Iterator[list[int]]:
         replay, seen = tape(work)
         return lambda: (replays.append(len(replays)), replay()), seen
 
-    with without(*CPU_BACKENDS), torch_on_one_thread(), pytest.MonkeyPatch.context() as patch:
+    with without(*CPU_BACKENDS), torch_on_one_thread(shares_out=False), pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrainerSettings, "records", lambda settings, step: True)
         patch.setattr(TrainStep, "record_gradients", partialmethod(TrainStep.record_gradients, record=noted))
         yield replays

@@ -139,17 +139,29 @@ def test_what_a_subclass_of_somebody_saves_is_opened(tmp_path):
     assert longer.global_step == 2
 
 
+class Hooks(Callback):
+    def __init__(self):
+        self.updates = self.backwards = 0
+
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
+        self.updates += 1
+
+    def on_after_backward(self, trainer, pl_module):
+        self.backwards += 1
+
+
 def test_steps_of_a_trainer_of_ones_own_are_replayed(tmp_path):
     losses, quietly = [], {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
     for records in (False, True):
-        outputs = Outputs()
+        outputs, hooks = Outputs(), Hooks()
         with steps_on_tape() as replays, pytest.MonkeyPatch.context() as patch:
             patch.setattr(TrainerSettings, "records", lambda settings, step, records=records: records)
             run = made_run(tmp_path)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                quiet(max_steps=4, limit_val_batches=0, callbacks=[outputs], **quietly).fit(run.system, run.data)
+                quiet(max_steps=4, limit_val_batches=0, callbacks=[outputs, hooks], **quietly).fit(run.system, run.data)
         assert len(replays) == 4 * records
+        assert (hooks.updates, hooks.backwards > 0) == (4, not records)
         assert run.system.step.recorded is None  # a system can be copied
         losses.append(torch.stack(outputs.train))
     assert torch.equal(*losses)

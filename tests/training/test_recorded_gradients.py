@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.gpu_training import step_by_step
 from support.tape import tape
+from support.two_processes import in_two_processes
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
@@ -76,6 +77,25 @@ def test_each_of_several_processes_records_its_share(monkeypatch):
     run = trained([48] * 3, record=True)
     assert_same(run, trained([48] * 3, record=False))
     assert [size for size, _ in run.training.recorded.recordings] == [24]
+
+
+IN_TWO = """
+from test_recorded_gradients import CPU_BACKENDS, OccupancySampler, trained, without
+OccupancySampler.capacity_for = lambda sampler, rays: 8192
+with without(*CPU_BACKENDS):
+    runs = [trained([48, 32, 48, 48], record) for record in (True, False)]
+sizes = [size for size, _ in runs[0].training.recorded.recordings]
+replayed, taken = ((run.all_losses(), run.training.model.state_dict()) for run in runs)
+result = sizes, replayed, taken, [each.detach() for each in runs[0].training.model.parameters()]
+"""
+
+
+def test_two_processes_that_replay_their_shares_learn_what_they_learn_without_and_the_same(tmp_path):
+    one, other = in_two_processes(IN_TWO, tmp_path)
+    for sizes, replayed, taken, _ in (one, other):
+        assert sizes == [24, 16]
+        torch.testing.assert_close(replayed, taken, rtol=0, atol=0)
+    assert all(map(torch.equal, one[-1], other[-1]))
 
 
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():

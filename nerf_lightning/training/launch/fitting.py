@@ -6,14 +6,22 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateFinder, ModelPruning, Timer
+from lightning.pytorch.callbacks import (
+    BatchSizeFinder,
+    GradientAccumulationScheduler,
+    LearningRateFinder,
+    ModelPruning,
+    Timer,
+)
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
+from torch import nn
 
 from nerf_lightning.checkpoints.format import PRECISIONS
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.launch.strategy import OneSumPerStep
 
 log = logging.getLogger(__name__)
@@ -92,9 +100,9 @@ def require_fitting(trainer: Trainer) -> None:
             f"trainer.clip_norm={clip}.",
         ),
         (
-            trainer.accumulate_grad_batches != 1,
-            "A step already adds up the gradients of its tiles. Leave Trainer(accumulate_grad_batches=...) out, and "
-            "give build_run a larger data.batch_rays.",
+            trainer.accumulate_grad_batches != 1 or _has(callbacks, GradientAccumulationScheduler),
+            "A step already adds up the gradients of its tiles. Leave Trainer(accumulate_grad_batches=...) and "
+            "GradientAccumulationScheduler out, and give build_run a larger data.batch_rays.",
         ),
         (
             _has(callbacks, BatchSizeFinder),
@@ -110,17 +118,29 @@ def require_fitting(trainer: Trainer) -> None:
             "ModelPruning replaces the weights that the step and its kernels hold. Leave it out; a smaller model is "
             "model=fast_small or field.width.",
         ),
-        (
-            torch.are_deterministic_algorithms_enabled()
-            and trainer.strategy.root_device.type == "cuda"
-            and any(isinstance(part, HashGridEncoder) for part in trainer.lightning_module.modules()),
-            "Trainer(deterministic=True) cannot be kept: on a GPU the gradients of hash grids are sums by atomic "
-            "additions, whose order varies. Leave it out, train on a CPU, or choose a model without hash grids, such "
-            "as model=nerf.",
-        ),
     ):
         if refused:
             raise InputError(words)
+    if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
+        require_deterministic(trainer.lightning_module, trainer.strategy.root_device.type)
+
+
+def require_deterministic(module: nn.Module, device_type: str) -> None:
+    """Refuse to promise the same bits in each run where sums are taken in any order.
+
+    Args:
+        module: what is trained.
+        device_type: where.
+
+    Raises:
+        InputError: it has hash grids, and trains on a GPU of NVIDIA's.
+    """
+    if device_type == "cuda" and any(isinstance(part, HashGridEncoder) for part in module.modules()):
+        raise InputError(
+            "trainer.deterministic=true (Trainer(deterministic=True)) cannot be kept: on a GPU the gradients of hash "
+            "grids are sums by atomic additions, whose order varies. Leave it out, train on a CPU, or choose a model "
+            "without hash grids, such as model=nerf."
+        )
 
 
 def _has(callbacks: list[Any], kind: type) -> bool:
@@ -129,9 +149,11 @@ def _has(callbacks: list[Any], kind: type) -> bool:
 
 def _warn_of_timer(trainer: Trainer) -> None:
     """Say that a run that is ended by Lightning's clock may end with a high learning rate."""
-    if _has(trainer.callbacks, Timer):  # type: ignore[attr-defined]
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]
+    ends = any(isinstance(each, Timer) and each.time_remaining() is not None for each in callbacks)
+    if ends and not _has(callbacks, TimeBudget):
         log.warning(
-            "Lightning's Timer (max_time) may end this run before its %d steps, and with the learning rate still high. "
-            "Give max_steps that fit the time, or use nerf train budget.seconds=N, whose rate follows the time.",
-            trainer.max_steps,
+            "Lightning's Timer (max_time) may end this run before its last step, and with the learning rate still "
+            "high. Use Trainer(max_steps=1_000_000, callbacks=[TimeBudget(seconds=...)]) of nerf_lightning.training."
+            "callbacks.time_budget, or nerf train budget.seconds=N: the rate follows the time."
         )
