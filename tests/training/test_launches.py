@@ -17,7 +17,7 @@ BUDGETS = {
     # host: a step.
     "fast_small,bf16-mixed": (80, 8, 36, 2),
     "fast_proposal,bf16-mixed": (118, 8, 27, 2),
-    "nerf_tiny,bf16-mixed": (250, 8, 114, 4),
+    "nerf_tiny,bf16-mixed": (246, 8, 110, 4),
     "fast,bf16-mixed": (80, 8, 36, 2),
     "fast,32-true": (90, 8, 40, 2),
     "fast_proposal,32-true": (138, 8, 35, 2),
