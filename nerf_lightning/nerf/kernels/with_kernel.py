@@ -4,9 +4,6 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-import torch
-from torch import Tensor
-
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 
 Arguments = ParamSpec("Arguments")
@@ -42,8 +39,3 @@ def with_kernel(*modules: str) -> Callable[[Callable[Arguments, Result]], Callab
         return either
 
     return decorate
-
-
-def are_rows(*tensors: Tensor) -> bool:
-    """Return whether tensors are float32, with a row for each ray: what kernels take."""
-    return all(each.dim() == 2 and each.dtype == torch.float32 for each in tensors)

@@ -13,9 +13,8 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
-from nerf_lightning.nerf.kernels.histograms.ray_loss import RayLoss
+from nerf_lightning.nerf.kernels.histograms.op import RayLoss, distortion, interlevel, takes_bounds, takes_histogram
 from nerf_lightning.nerf.kernels.threads import over_rows
-from nerf_lightning.nerf.kernels.with_kernel import are_rows
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -30,9 +29,7 @@ def sample_histogram(
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
-    if not are_rows(edges, weights, u) or edges.requires_grad or weights.requires_grad:
-        return None
-    if edges.shape[1] != weights.shape[1] + 1:
+    if not takes_histogram(edges, weights, u):
         return None
     out = torch.empty(u.shape)
     arrays = (each.detach().contiguous().numpy() for each in (edges, weights, u))
@@ -48,7 +45,7 @@ def stratified_edges(
     contracted: bool,
 ) -> Float[Tensor, "*rays edges"] | None:
     """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
-    if low.dim() != 1 or low.dtype != torch.float32 or low.requires_grad or high.requires_grad:
+    if not takes_bounds(low, high):
         return None
     out, shift = torch.empty(len(low), len(shares)), torch.empty(len(low), 0) if jitter is None else jitter
     arrays = (each.contiguous().numpy() for each in (shares, shift, low, high))
@@ -58,18 +55,12 @@ def stratified_edges(
 
 def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"] | None:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for the proposal's weights."""
-    if not are_rows(last.weights, proposal.weights):
-        return None
-    given = last.samples.edges, last.weights, proposal.samples.edges
-    return RayLoss.apply(_over_rays(_interlevel), proposal.weights, *map(Tensor.detach, given))
+    return interlevel(_over_rays(_interlevel), last, proposal)
 
 
 def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"] | None:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for the weights alone."""
-    edges, w = rendering.samples.edges, rendering.weights
-    if not are_rows(w) or edges.requires_grad:
-        return None
-    return RayLoss.apply(_over_rays(_distortion, rendering.samples.contracted_spacing), w, edges)
+    return distortion(_over_rays(_distortion, rendering.samples.contracted_spacing), rendering)
 
 
 def trial() -> None:

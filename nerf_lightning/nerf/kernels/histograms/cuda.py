@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
-from nerf_lightning.nerf.kernels.histograms.ray_loss import RayLoss
-from nerf_lightning.nerf.kernels.with_kernel import are_rows
+from nerf_lightning.nerf.kernels.histograms.op import RayLoss, distortion, interlevel, takes_bounds, takes_histogram
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 LANES = 32
@@ -31,9 +30,7 @@ def sample_histogram(
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
-    if not are_rows(edges, weights, u) or edges.requires_grad or weights.requires_grad:
-        return None
-    if edges.shape[1] != weights.shape[1] + 1:
+    if not takes_histogram(edges, weights, u):
         return None
     out = torch.empty(u.shape, device=u.device)
     if out.numel():
@@ -53,7 +50,7 @@ def stratified_edges(
     contracted: bool,
 ) -> Float[Tensor, "*rays edges"] | None:
     """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
-    if low.dim() != 1 or low.dtype != torch.float32 or low.requires_grad or high.requires_grad:
+    if not takes_bounds(low, high):
         return None
     rays, count = len(low), len(shares)
     out = torch.empty(rays, count, device=low.device)
@@ -67,18 +64,12 @@ def stratified_edges(
 
 def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"] | None:
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for the proposal's weights."""
-    if not are_rows(last.weights, proposal.weights):
-        return None
-    given = last.samples.edges, last.weights, proposal.samples.edges
-    return RayLoss.apply(_on_rays(_interlevel), proposal.weights, *map(Tensor.detach, given))
+    return interlevel(_on_rays(_interlevel), last, proposal)
 
 
 def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"] | None:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for the weights alone."""
-    edges, w = rendering.samples.edges, rendering.weights
-    if not are_rows(w) or edges.requires_grad:
-        return None
-    return RayLoss.apply(_on_rays(_distortion, rendering.samples.contracted_spacing), w, edges)
+    return distortion(_on_rays(_distortion, rendering.samples.contracted_spacing), rendering)
 
 
 def trial(device: str = "cuda") -> None:
