@@ -2,7 +2,7 @@
 
 import logging
 import math
-from typing import Any
+from collections.abc import Iterator
 
 import torch
 from lightning.pytorch import Trainer
@@ -70,59 +70,68 @@ def require_fitting(trainer: Trainer) -> None:
     Raises:
         InputError: with what to set instead.
     """
-    callbacks = trainer.callbacks  # type: ignore[attr-defined]
-    ours = trainer.precision if trainer.precision in PRECISIONS else f"... (one of {', '.join(PRECISIONS)})"
-    again, clip = trainer.overfit_batches, trainer.gradient_clip_val  # type: ignore[attr-defined]
-    for refused, words in (
-        (
-            trainer.precision != "32-true",
-            f"Trainer(precision={trainer.precision}) would lower cameras and quadrature too: leave it out, and give "
-            f"build_run trainer.precision={ours}, which is for the fields alone.",
-        ),
-        (
-            not isinstance(trainer.strategy, SingleDeviceStrategy | DDPStrategy),
-            f"{type(trainer.strategy).__name__} divides weights among devices, and a step needs all of them. Leave "
-            "Trainer(strategy=...) out, or use nerf train trainer=ddp for several devices.",
-        ),
-        (
-            trainer.world_size > 1 and not isinstance(trainer.strategy, OneSumPerStep),
-            "With several devices Lightning's Trainer would add up gradients in each tile of a step. Use nerf train "
-            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.strategy.",
-        ),
-        (
-            again,
-            f"Trainer(overfit_batches={again}) has no effect on rays, of which each step sees others. To learn few "
-            "views, give build_run scene.frames.",
-        ),
-        (
-            clip,
-            f"Trainer(gradient_clip_val={clip}) would clip each tile of a step. Leave it out, and give build_run "
-            f"trainer.clip_norm={clip}.",
-        ),
-        (
-            trainer.accumulate_grad_batches != 1 or _has(callbacks, GradientAccumulationScheduler),
-            "A step already adds up the gradients of its tiles. Leave Trainer(accumulate_grad_batches=...) and "
-            "GradientAccumulationScheduler out, and give build_run a larger data.batch_rays.",
-        ),
-        (
-            _has(callbacks, BatchSizeFinder),
-            "BatchSizeFinder finds no batch size: a batch is rays, cut into tiles that fit the memory. Leave it out, "
-            "and give build_run data.batch_rays.",
-        ),
-        (
-            _has(callbacks, LearningRateFinder),
-            "LearningRateFinder takes steps that a run would count. Leave it out, and give build_run optimizer.lr.",
-        ),
-        (
-            _has(callbacks, ModelPruning),
-            "ModelPruning replaces the weights that the step and its kernels hold. Leave it out; a smaller model is "
-            "model=fast_small or field.width.",
-        ),
-    ):
-        if refused:
-            raise InputError(words)
+    reasons = [*_of_settings(trainer), *_of_devices(trainer), *_of_callbacks(trainer)]
+    if reasons:
+        raise InputError(reasons[0])
     if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
         require_deterministic(trainer.lightning_module, trainer.strategy.root_device.type)
+
+
+def _of_settings(trainer: Trainer) -> Iterator[str]:
+    again, clip = trainer.overfit_batches, trainer.gradient_clip_val  # type: ignore[attr-defined]
+    if trainer.precision != "32-true":
+        ours = trainer.precision if trainer.precision in PRECISIONS else f"... (one of {', '.join(PRECISIONS)})"
+        yield (
+            f"Trainer(precision={trainer.precision}) would lower cameras and quadrature too: leave it out, and give "
+            f"build_run trainer.precision={ours}, which is for the fields alone."
+        )
+    if again:
+        yield (
+            f"Trainer(overfit_batches={again}) has no effect on rays, of which each step sees others. To learn few "
+            "views, give build_run scene.frames."
+        )
+    if clip:
+        yield (
+            f"Trainer(gradient_clip_val={clip}) would clip each tile of a step. Leave it out, and give build_run "
+            f"trainer.clip_norm={clip}."
+        )
+
+
+def _of_devices(trainer: Trainer) -> Iterator[str]:
+    if not isinstance(trainer.strategy, SingleDeviceStrategy | DDPStrategy):
+        yield (
+            f"{type(trainer.strategy).__name__} divides weights among devices, and a step needs all of them. Leave "
+            "Trainer(strategy=...) out, or use nerf train trainer=ddp for several devices."
+        )
+    if trainer.world_size > 1 and not isinstance(trainer.strategy, OneSumPerStep):
+        yield (
+            "With several devices Lightning's Trainer would add up gradients in each tile of a step. Use nerf train "
+            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.strategy."
+        )
+
+
+def _of_callbacks(trainer: Trainer) -> Iterator[str]:
+    if trainer.accumulate_grad_batches != 1 or _has(trainer, GradientAccumulationScheduler):
+        yield (
+            "A step already adds up the gradients of its tiles. Leave Trainer(accumulate_grad_batches=...) and "
+            "GradientAccumulationScheduler out, and give build_run a larger data.batch_rays."
+        )
+    if _has(trainer, BatchSizeFinder):
+        yield (
+            "BatchSizeFinder finds no batch size: a batch is rays, cut into tiles that fit the memory. Leave it out, "
+            "and give build_run data.batch_rays."
+        )
+    if _has(trainer, LearningRateFinder):
+        yield "LearningRateFinder takes steps that a run would count. Leave it out, and give build_run optimizer.lr."
+    if _has(trainer, ModelPruning):
+        yield (
+            "ModelPruning replaces the weights that the step and its kernels hold. Leave it out; a smaller model is "
+            "model=fast_small or field.width."
+        )
+
+
+def _has(trainer: Trainer, kind: type) -> bool:
+    return any(isinstance(each, kind) for each in trainer.callbacks)  # type: ignore[attr-defined]
 
 
 def require_deterministic(module: nn.Module, device_type: str) -> None:
@@ -143,15 +152,11 @@ def require_deterministic(module: nn.Module, device_type: str) -> None:
         )
 
 
-def _has(callbacks: list[Any], kind: type) -> bool:
-    return any(isinstance(each, kind) for each in callbacks)
-
-
 def _warn_of_timer(trainer: Trainer) -> None:
     """Say that a run that is ended by Lightning's clock may end with a high learning rate."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]
     ends = any(isinstance(each, Timer) and each.time_remaining() is not None for each in callbacks)
-    if ends and not _has(callbacks, TimeBudget):
+    if ends and not _has(trainer, TimeBudget):
         log.warning(
             "Lightning's Timer (max_time) may end this run before its last step, and with the learning rate still "
             "high. Use Trainer(max_steps=1_000_000, callbacks=[TimeBudget(seconds=...)]) of nerf_lightning.training."
