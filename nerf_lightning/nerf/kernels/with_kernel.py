@@ -17,6 +17,7 @@ def with_kernel(*modules: str) -> Callable[[Callable[Arguments, Result]], Callab
         modules: of `nerf.kernels`, such as `random.cpu`. Each has a function of the same name and arguments, which
             returns None where it does not take what it is given.
 
+    >>> import torch
     >>> @with_kernel("random.cpu")
     ... def uniform(key, slots, word, count):
     ...     return "in plain torch"
