@@ -42,12 +42,18 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
             "hydra/launcher=slurm submits its jobs with Slurm's srun, which is not found here. Start the sweep where "
             "srun is (a login node of the cluster), or run its jobs on this machine: hydra/launcher=parallel."
         )
-    from nerf_lightning.config.hydra_versions import register_resolver
+    from nerf_lightning.config.hydra_versions import SWEEPS_REMOVE, register_resolver
     from nerf_lightning.files.made_folders import file_name
 
     register_resolver("file_name", file_name)  # Hydra hands it to the jobs
     # Hydra reads -m only before the overrides.
     arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
+    removed = [word for word in arguments if word.startswith("~") and "=" not in word]
+    if removed and not SWEEPS_REMOVE:
+        raise InputError(
+            f"The installed release candidate of Hydra 1.4 cannot remove settings in a sweep ({removed[0]}). Install "
+            "Hydra 1.3: pip install 'hydra-core<1.4'."
+        )
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
     current = {key: f"hydra.runtime.choices.{key}" if option_names(key) else key for key in _swept(arguments)}
     parts = ["${hydra.job.num}", *(f"{key}=${{{value}}}" for key, value in current.items())]

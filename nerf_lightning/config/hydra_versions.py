@@ -14,6 +14,8 @@ from omegaconf import OmegaConf
 IS_1_3 = hydra.__version__.startswith("1.3.")
 DEFAULTS = {"version_base": "1.3"} if IS_1_3 else {}
 """Of `hydra.main` and `initialize_config_dir`: how older versions of Hydra behaved is not asked for."""
+SWEEPS_REMOVE = not hydra.__version__.startswith("1.4.0rc")
+"""Whether a sweep can remove settings; release candidates of 1.4 pass `~key` to its jobs as `~key=null`."""
 
 
 def instantiate(node: Any, trusted: Sequence[str] | None = None) -> Any:

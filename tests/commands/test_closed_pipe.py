@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from support.running import FAST, start
+from support.running import FAST_SWEEP, start
 
 from nerf_lightning.cli.process import READER_LEFT, ends_quietly
 
@@ -39,7 +39,7 @@ def test_a_command_that_nobody_reads_ends_without_a_word(capture, tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_that_nobody_reads_stops_and_can_be_gone_on_with(capture, tmp_path):
-    quick = (*FAST, "logger=none", "final.video=false", f"paths.output_dir={tmp_path}")
+    quick = (*FAST_SWEEP, "logger=none", "final.video=false", f"paths.output_dir={tmp_path}")
     code, told = unread("train", "-m", "scene=npz", f"scene.path={capture}", *quick, "seed=0,1")
     assert code == READER_LEFT, told
     assert "Traceback" not in told

@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST, FAST_PATH, finished, said, saved, start, start_code, start_cold
+from support.running import FAST_PATH, FAST_SWEEP, finished, said, saved, start, start_code, start_cold
 from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
@@ -26,7 +26,7 @@ TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
 
 def arguments(capture, *extra):
     return (
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "data.batch_rays=101", "scheduler=constant",
+        "train", "scene=npz", f"scene.path={capture}", *FAST_SWEEP, "data.batch_rays=101", "scheduler=constant",
         f"trainer.max_steps={STEPS}", TILES, "scene.background=random", "final.video=false", "path.num_frames=3",
         "evaluation.max_views=3", "callbacks.validation_pictures.every_steps=1000", *extra,
     )  # fmt: skip

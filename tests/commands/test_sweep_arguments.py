@@ -7,6 +7,7 @@ from support.configs import composed
 from support.running import start_code
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
+from nerf_lightning.config import hydra_versions
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import SweepRecord
 
@@ -18,6 +19,15 @@ def leave_sweep(folder, *arguments, slurm_job=None):
 def test_the_flag_comes_first_wherever_it_was_typed_and_a_single_run_stays_as_it_is():
     assert sweep_arguments(["seed=0,1", "--multirun"])[:2] == ["-m", "seed=0,1"]
     assert sweep_arguments(["seed=0", "paths.output_dir=out"]) == ["seed=0", "paths.output_dir=out"]
+
+
+def test_what_the_release_candidates_of_hydra_cannot_remove_is_refused_before_a_folder_is_made(monkeypatch):
+    asked = ["-m", "seed=0,1", "~callbacks.monitor"]
+    monkeypatch.setattr(hydra_versions, "SWEEPS_REMOVE", True)
+    assert "~callbacks.monitor" in sweep_arguments(asked)
+    monkeypatch.setattr(hydra_versions, "SWEEPS_REMOVE", False)
+    with pytest.raises(InputError, match=r"~callbacks.monitor.*'hydra-core<1.4'"):
+        sweep_arguments(asked)
 
 
 def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):

@@ -10,7 +10,7 @@ from subprocess import STDOUT
 import pytest
 import torch
 from omegaconf import OmegaConf
-from support.running import FAST, finished, start, start_code
+from support.running import FAST_SWEEP, finished, start, start_code
 from support.systems import POSIX
 
 from nerf_lightning.compute.cores import num_cores
@@ -24,7 +24,7 @@ sys.argv = argv
 from nerf_lightning.cli.process import main
 main()
 """
-QUICK = (*FAST, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
+QUICK = (*FAST_SWEEP, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
 
 
 def arguments(capture, folder, *more):

@@ -11,6 +11,7 @@ import pytest
 import torch
 from support.fork_server import Forked, fits_a_fork
 
+from nerf_lightning.config.hydra_versions import SWEEPS_REMOVE
 from nerf_lightning.messages.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
@@ -35,6 +36,7 @@ FAST = (
     "trainer.tile_points=8192",
     "trainer.max_steps=4",
 )
+FAST_SWEEP = FAST if SWEEPS_REMOVE else tuple(word for word in FAST if word != NO_LAYOUT)
 # The hash grid with its occupancy grid, as small; its settings take the place of those above.
 FAST_PATH = (
     "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
