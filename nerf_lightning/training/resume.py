@@ -50,14 +50,15 @@ def loops_after(steps: int) -> dict[str, Any]:
     fit: Any = _FitLoop(no_trainer)
     epoch, optimizer_steps = fit.epoch_loop, fit.epoch_loop.manual_optimization.optim_step_progress
     evaluation = epoch.val_loop.state_dict()
-    epoch._batches_that_stepped = steps
     for epochs in (fit.epoch_progress.total, fit.epoch_progress.current):
         epochs.ready = epochs.started = 1
     for batches in (epoch.batch_progress.total, epoch.batch_progress.current):
         batches.ready = batches.started = batches.processed = batches.completed = steps
     for taken in (optimizer_steps.total, optimizer_steps.current):
         taken.ready = taken.completed = steps
-    states = fit.state_dict(), evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
+    state = fit.state_dict()
+    state["epoch_loop.state_dict"]["_batches_that_stepped"] = steps  # what Lightning numbers its own log by
+    states = state, evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
     return dict(zip(LOOPS, states, strict=True))
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.optim import Optimizer
@@ -16,17 +16,16 @@ from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
-from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
+from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run, require_fitting
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.resume import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
-from nerf_lightning.training.steps_in_a_row import StepsInARow, logs_for
 from nerf_lightning.training.validation import RayErrors
 
 
@@ -95,37 +94,25 @@ class RadianceFieldSystem(LightningModule):
         """
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
         self.step.begin_recording()
-        self.in_a_row = StepsInARow(self.trainer, self)
 
     def on_fit_end(self) -> None:
-        """Forget the trainer and what was recorded: copies and pickles of the system are without them."""
-        del self.in_a_row
+        """Forget what was recorded: copies and pickles of the system are without it."""
         self.step.recorded = None
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
 
-        Where steps are replayed, it goes on until somebody looks at one (`StepsInARow`).
-
         Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
         """
-        seen, taken = self._take_step(batch), 1
-        while self.in_a_row.another(taken):
-            seen, taken = self._take_step(self.in_a_row.batch()), taken + 1
+        callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        watched = any(isinstance(each, Monitor) and each.wants_gradients(self.trainer, self) for each in callbacks)
+        seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen.losses.sum()
-        if not logs_for(self.trainer):
+        if not any(isinstance(each, Monitor | TrainingProgress) for each in callbacks):
             # What is on a bar is read in each step, for which the device is waited for.
             on_bar = self.trainer.progress_bar_callback is not None
             self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=on_bar)
         return {"loss": loss, "step": seen}
-
-    def _take_step(self, batch: Batch) -> StepOutput:
-        watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
-        return self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
-
-    def monitors(self) -> list[Monitor]:
-        """Return the callbacks that log scalars."""
-        return [each for each in self.trainer.callbacks if isinstance(each, Monitor)]  # type: ignore[attr-defined]
 
     def validation_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Collect the squared error of fixed rays; return its mean over the batch as `loss`, and the `psnr` (dB)."""

@@ -103,10 +103,6 @@ class LiveView(Callback):
         # Its token is for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether anybody looks on, or has asked to stop."""
-        return self.switch.wants_stop or not (self.page is None or self.page.queue.is_empty)
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
         if ranks.largest(float(self.switch.wants_stop)):
@@ -150,7 +146,7 @@ class LiveView(Callback):
             seconds = self.switch.pause_while(
                 page.queue.work_or_wait,
                 lambda: not page.is_empty,
-                lambda: any(each.is_due(trainer, system) for each in signals),
+                lambda: any(each.asked_to_stop() for each in signals),
             )
         finally:
             renderer.share = share

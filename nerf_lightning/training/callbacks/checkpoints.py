@@ -43,10 +43,6 @@ class Checkpoints(Callback):
         if self.folder(trainer).is_dir():  # a run that ends without a further step would leave them
             remove_leftovers(self.folder(trainer))
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it is time for a checkpoint."""
-        return trainer.global_step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Write `last.ckpt` when it is time.
 
@@ -54,7 +50,7 @@ class Checkpoints(Callback):
             InputError: an earlier one could not be written.
         """
         writer(trainer, self).raise_failure()
-        if self.is_due(trainer, pl_module) and pl_module.step.all_finite():
+        if trainer.global_step % self.every_steps == 0 and pl_module.step.all_finite():
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:

@@ -50,10 +50,6 @@ class CollapseGuard(Callback):
         self.ratio, self.max_restarts = ratio, max_restarts
         self.failed = 0
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it may be time to look."""
-        return pl_module.step.progress.step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then, and log a restart."""
         batches, optimizer = trainer.datamodule.batches, pl_module.optimizers().optimizer  # type: ignore[attr-defined]

@@ -62,10 +62,6 @@ class NanGuard(Callback):
         """
         writer(trainer, self)
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it is time to look at the weights."""
-        return pl_module.step.progress.step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look whether the run still learns.
 

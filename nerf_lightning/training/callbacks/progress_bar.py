@@ -60,10 +60,6 @@ class TrainingProgress(ProgressBar):
         self.task = self.bar.add_task("", total=None, step=f"{trainer.global_step:,}", left="")
         self.bar.start()
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Never: it ends no row of steps (`StepsInARow`)."""
-        return False
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step

@@ -55,13 +55,8 @@ class TimeBudget(Callback):
         else:
             self.first = pl_module.step.progress.step
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether to estimate the length of the run, or to stop; the first step compiles, and is not counted."""
-        is_over = self.used + time.perf_counter() - self.since >= self.seconds
-        return self.compiles or is_over or pl_module.step.progress.step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Estimate the length of the run, and stop when the time is over."""
+        """Estimate the length of the run, and stop when time is over; the first step compiles, and is not counted."""
         now = time.perf_counter()
         if not self.compiles:
             # All processes stop at the same step: the slowest clock is everybody's.

@@ -33,12 +33,8 @@ class Watcher(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Look when it is time."""
-        if self.is_due(trainer, pl_module):
+        if self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches)):
             self.watch(trainer, pl_module, outputs)
-
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether to look after the step that was taken."""
-        return self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches))
 
     def is_time(self, step: int, last_step: int) -> bool:
         """Tell whether to look after a step."""
