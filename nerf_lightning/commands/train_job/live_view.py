@@ -15,7 +15,6 @@ from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address, tunnel
@@ -89,7 +88,7 @@ class LiveView(Callback):
             pl_module.model,
             scene_record(scene),
             scene.background,
-            pl_module.step.tiles.points or WHOLE_BATCH_POINTS,
+            pl_module.train_step.tiles.picture_points,
             self.share,
             MOVING_SECONDS,
         )
@@ -110,7 +109,7 @@ class LiveView(Callback):
             self._say(f"training was stopped from the page at step {trainer.global_step}")
         if self.page is None:
             return
-        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.step.num_steps
+        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.train_step.num_steps
         if self.switch.wants_pause:
             self._pause(trainer, pl_module, self.page)
         now = time.perf_counter()

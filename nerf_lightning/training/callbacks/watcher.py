@@ -14,7 +14,6 @@ from torch.utils.tensorboard import SummaryWriter
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.visualization.pictures import LONGEST_PANEL
 
 
@@ -91,7 +90,7 @@ def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int,
     scene = trainer.datamodule.scene
     views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
-    tile_points = system.step.tiles.points or WHOLE_BATCH_POINTS
+    tile_points = system.train_step.tiles.picture_points
     system.eval()
     rays = system.rays.at_most(LONGEST_PANEL)
     picture = render_picture(system.model, rays, view, scene.background, tile_points)
