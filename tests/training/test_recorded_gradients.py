@@ -75,9 +75,10 @@ def test_each_of_several_processes_records_its_share(monkeypatch):
     monkeypatch.setattr(ranks, "world_size", lambda: 2)
     monkeypatch.setattr(ranks, "add_up", lambda tensors: None)  # the other one has nothing to add
     monkeypatch.setattr(ranks, "from_first", lambda make: make())
-    run = trained([48] * 3, record=True)
-    assert_same(run, trained([48] * 3, record=False))
-    assert [size for size, _ in run.training.gradients.recordings] == [24]
+    sizes = [48, 48, 47]  # of which it has 24 each time
+    run = trained(sizes, record=True)
+    assert_same(run, trained(sizes, record=False))
+    assert [(size, whole) for size, (_, whole, *_) in run.training.gradients.recordings] == [(24, 48), (24, 47)]
 
 
 IN_TWO = """

@@ -62,7 +62,7 @@ class _Recording:
 
 
 class RecordedGradients:
-    """Compute the gradients of batches, whole, by replaying the first of their size and the parts' variants.
+    """Compute the gradients of batches, whole, by replaying the first of their size, share and parts' variants.
 
     Args:
         tiles: computes them.
