@@ -44,7 +44,7 @@ class TrainStep:
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
         clip_norm: maximum norm of the gradient, to which larger ones are scaled down; None: no clipping.
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
-        start_weights: the model's state from which attempts start; None: they draw weights.
+        start_weights: the model's state from which attempts start (`draw_weights`); None: they draw it.
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
         jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
             evaluation, so that steps differ in their pixels alone.
