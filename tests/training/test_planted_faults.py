@@ -42,11 +42,8 @@ def trained(scene, steps, *settings):
 @torch.no_grad()
 def quality(train_step, scene):
     """PSNR on the test views of a scene, from where their cameras really are."""
-    rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
-    pictures = [
-        (render_picture(train_step.objective.model, rays_of, view, "white", TILE).rgb, view)
-        for view in scene.splits["test"]
-    ]
+    model, rays_of = train_step.objective.model, RayGenerator(scene.cameras, scene.near, scene.far)
+    pictures = [(render_picture(model, rays_of, view, "white", TILE).rgb, view) for view in scene.splits["test"]]
     errors = [(rgb - photograph(scene, view, "white")).square().mean() for rgb, view in pictures]
     return float(psnr(torch.stack(errors)).mean())
 
