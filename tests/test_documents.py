@@ -67,7 +67,7 @@ def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
     ):
         assert example.count(given) == 1
         example = example.replace(given, instead)
-    check = "\nprint(run.system.step.progress.step, system.step.progress.step)\n"
+    check = "\nprint(run.system.train_step.progress.step, system.train_step.progress.step)\n"
     process = start_code(example + check, cwd=tmp_path)
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
@@ -144,8 +144,8 @@ def test_the_loss_in_a_file_of_ones_own_trains(tmp_path, monkeypatch):
     small = ("scene=npz", f"scene.path={capture}", "model=nerf_tiny", "data.batch_rays=32", "data.val_rays=32")
     run = build_run(*small, "loss._target_=my_losses.L1")
     Trainer(max_steps=3, accelerator="cpu", logger=False, default_root_dir=tmp_path).fit(run.system, run.data)
-    assert type(run.system.step.objective.loss).__name__ == "L1"
-    assert run.system.step.progress.step == 3
+    assert type(run.system.train_step.objective.loss).__name__ == "L1"
+    assert run.system.train_step.progress.step == 3
 
 
 def commands():
@@ -256,7 +256,7 @@ SMALLER = (
 AT_THE_END = {
     "first_scene": "assert picture.rgb.shape == (16, 16, 3) and len(plt.get_fignums()) == 3, picture.rgb.shape",
     "own_field_and_loss": (
-        "assert run.system.step.progress.step == 3 and len(pictures) == 4\n"
+        "assert run.system.train_step.progress.step == 3 and len(pictures) == 4\n"
         "trainer.save_checkpoint('own.ckpt')\n"
         "try:\n    nl.load('own.ckpt')\n"
         "except nl.InputError as error:\n    print('refused:', error)"

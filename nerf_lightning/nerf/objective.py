@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_errors
@@ -78,6 +79,9 @@ class Objective(Part):
         loss: named terms, each with a number per level; the sum of all is minimized.
         background: what lies behind the rays.
         correction: what photographs make of the rendered colors; None leaves them alone.
+
+    Raises:
+        InputError: several rays a pixel, and a loss that looks at single rays.
     """
 
     correction: Correction | None
@@ -91,6 +95,12 @@ class Objective(Part):
         correction: Correction | None = None,
     ):
         super().__init__()
+        if model.subpixels.side > 1 and loss.needs_weights:
+            raise InputError(
+                f"model.subpixels={model.subpixels.side} compares the mean of several rays with a photograph's pixel, "
+                f"and the loss {type(loss).__name__} looks at the samples of single rays, as model=fast_proposal wants "
+                "it. Leave model.subpixels out, or choose another loss or model."
+            )
         self.model, self.rays, self.correction = model, rays, correction
         self.loss, self.background = loss, background
 

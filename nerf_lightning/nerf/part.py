@@ -143,6 +143,12 @@ def buffers_to_average(module: nn.Module) -> list[Tensor]:
     return [mean for part in parts_of(module) for mean in part.buffers_to_average()]
 
 
+def reset_statistics(module: nn.Module) -> None:
+    """Let every part within a module forget what it counted."""
+    for part in parts_of(module):
+        part.reset_statistics()
+
+
 def statistics(module: nn.Module) -> dict[str, float]:
     """Return what is worth watching while training."""
     return {name: value for part in parts_of(module) for name, value in part.statistics().items()}

@@ -31,6 +31,7 @@ from nerf_lightning.training.callbacks.nan_guard import CURE, NanGuard
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.resume import loops_after, require_resumable, restore_run
 from nerf_lightning.training.run import Run, assemble
+from nerf_lightning.training.step_guard import first_not_finite
 
 OF_LIGHTNINGS_TRAINER = {
     "trainer.max_steps": "Trainer(max_steps=...), or run.steps(...)",
@@ -71,18 +72,18 @@ class StepwiseRun(Run):
         Raises:
             InputError: nothing is learned any more (NanGuard), or Lightning's Trainer has trained this run.
         """
-        step, batches, optimizer = self.system.step, self.data.batches, self.optimizer
-        step.num_steps = until
-        self.data.settle(step.device)
-        step.begin_recording()
+        train_step, batches, optimizer = self.system.train_step, self.data.batches, self.optimizer
+        train_step.num_steps = until
+        self.data.settle(train_step.device)
+        train_step.begin_recording()
         rays = iter(batches)
         while self.num_steps < until:
             self.system.train()
-            batch = next(rays).to(step.device)
-            seen = step(batch, optimizer)
+            batch = next(rays).to(train_step.device)
+            seen = train_step(batch, optimizer)
             self.num_steps += 1
-            self.collapse_guard.look(step, batches, optimizer, seen, self.num_steps)
-            if cause := self.nan_guard.cause(step):
+            self.collapse_guard.look(train_step, batches, optimizer, seen, self.num_steps)
+            if cause := self.nan_guard.cause(train_step):
                 raise InputError(f"{cause}, so the run stops. Start again, or resume a checkpoint, with {CURE}.")
             measured = {"loss": float(seen.losses.sum()), "psnr": float(psnr(seen.color_errors[-1]))}
             yield {"step": self.num_steps, "num_rays": batch.num_rays} | measured
@@ -95,13 +96,13 @@ class StepwiseRun(Run):
             InputError: Lightning's Trainer has trained this run, with an optimizer of its own.
         """
         if self._optimizer is None:
-            if self.system.step.progress.rays_seen:
+            if self.system.train_step.progress.rays_seen:
                 raise InputError(
                     "Lightning's Trainer has trained this run, and has its optimizer: save it with "
                     "trainer.save_checkpoint(FILE), and continue with build_run(..., resume=FILE)."
                 )
             self.system.to(self.settings.device)
-            self._optimizer = self.system.step.new_optimizer()
+            self._optimizer = self.system.train_step.new_optimizer()
         return self._optimizer
 
     @property
@@ -120,7 +121,7 @@ class StepwiseRun(Run):
             InputError: the weights are not finite, Lightning's Trainer has trained this run, or the file cannot be
                 written.
         """
-        if broken := self.system.step.broken_weights():
+        if broken := first_not_finite(self.system.train_step.objective.named_weights()):
             raise InputError(f"The weights of {broken} are not finite numbers, so they are not saved. Use {CURE}.")
         training = {
             "epoch": 0,
@@ -134,7 +135,7 @@ class StepwiseRun(Run):
 
     def restore(self, path: str | os.PathLike[str]) -> None:
         """Go on from a checkpoint of this run; see `build_run`."""
-        step, guard, file = self.system.step, self.collapse_guard, Path(path)
+        train_step, guard, file = self.system.train_step, self.collapse_guard, Path(path)
         content = content_to_resume(file)
         state, kept = content[KEY], content.get("callbacks", {})
         require_same_capture(state, self.system.record, self.system.resume_changed_capture)
@@ -143,12 +144,12 @@ class StepwiseRun(Run):
             file,
             weights=self.system.state_dict(),
             optimizer=self.optimizer,
-            build=step.build_optimizer,
+            build=train_step.build_optimizer,
             callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without
             loops=loops_after(0),
-            progress=step.progress,
+            progress=train_step.progress,
         )
-        restore_run(state, step, step.device)
+        restore_run(state, train_step, train_step.device)
         self.system.load_state_dict(content["state_dict"])
         self.optimizer.load_state_dict(content["optimizer_states"][0])
         guard.load_state_dict(kept.get(guard.state_key, guard.state_dict()))

@@ -54,34 +54,35 @@ class Training:
         scene, progress = ball_scene(), Progress()
         config, _ = compose_config("train", [f"model={method}", f"seed={SEED}", *METHODS[method]])
         settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
-        self.step = build_step(config, settings, scene, progress).to(device)
-        self.step.num_steps = STEPS
-        set_precision(self.step.model, matmul_precision)
+        self.train_step = build_step(config, settings, scene, progress)
+        self.train_step.objective.to(device)
+        self.train_step.num_steps = STEPS
+        set_precision(self.train_step.objective.model, matmul_precision)
         self.loader = RayBatches(on_device(scene, device), progress, SEED, BATCH_RAYS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
-        self.optimizer = self.step.new_optimizer()
+        self.optimizer = self.train_step.new_optimizer()
 
     def gradients(self) -> dict[str, Tensor]:
         """Return the gradients of the first batch, with tables as large as trained ones are."""
         # Fresh ones are all but zero: whatever is done with them would hardly matter.
         with torch.no_grad():
-            for table in tables_of(self.step.model):
+            for table in tables_of(self.train_step.objective.model):
                 table.mul_(LEARNT)
         self.optimizer.zero_grad()
-        self.step.gradients(self.loader.at(0, 0).to(self.step.device))
-        named = self.step.model.named_parameters()
+        self.train_step.gradients(self.loader.at(0, 0).to(self.train_step.device), self.train_step.key)
+        named = self.train_step.objective.model.named_parameters()
         return {name: value.grad.clone() for name, value in named if value.grad is not None}
 
     def psnr(self) -> float:
         """Train, and return the PSNR of the held-out views."""
-        step, errors = self.step, RayErrors()
+        train_step, errors = self.train_step, RayErrors()
         for _ in range(STEPS):
-            step(self.loader.at(0, step.progress.rays_seen).to(step.device), self.optimizer)
+            train_step(self.loader.at(0, train_step.progress.rays_seen).to(train_step.device), self.optimizer)
         with torch.no_grad():
             for batch in self.held_out:
-                errors.of(step.objective, batch.to(step.device), step.tiles.points)
-        if step.guard.skipped:
-            raise ValueError(f"{step.guard.skipped} of {STEPS} steps had gradients that are not finite")
+                errors.of(train_step.objective, batch.to(train_step.device), train_step.tiles.points)
+        if train_step.guard.skipped:
+            raise ValueError(f"{train_step.guard.skipped} of {STEPS} steps had gradients that are not finite")
         return errors.summary()["val/psnr"]
 
 

@@ -19,6 +19,7 @@ from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.fitting import require_deterministic
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -79,7 +80,7 @@ def build_step(
     loss = build(config.loss) if loss is None else loss
     corrects, refines = not isinstance(correction, NoCorrection), refinement.moves()
     rays = RayGenerator.of_views(scene, model.needs_photographs, refinement if refines else None)
-    return TrainStep(
+    train_step = TrainStep(
         objective=Objective(model, rays, loss, scene.background, correction if corrects else None),
         optimizer=optimizer,
         schedule=build(config.scheduler),
@@ -92,3 +93,5 @@ def build_step(
         jitter=config.data.overfit_views is None,
         records=settings.records_there,
     )
+    draw_weights(train_step)
+    return train_step

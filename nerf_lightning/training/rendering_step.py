@@ -39,5 +39,4 @@ def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Train
         progress=Progress(),
         seed=0,
         tile_points=settings.tile_points,
-        start_weights=checkpoint.weights,
     )

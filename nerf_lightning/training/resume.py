@@ -33,12 +33,12 @@ WAYS = ("fused", "foreach", "capturable")
 Build = Callable[[Iterable[Any]], Optimizer]
 
 
-def run_state(step: TrainStep) -> dict[str, Any]:
+def run_state(train_step: TrainStep) -> dict[str, Any]:
     """Return what a checkpoint keeps of a run beside its record, weights and optimizer."""
     return {
-        "progress": asdict(step.progress),
-        "bad_steps": step.guard.state(),
-        "tile_points": step.tiles.points,
+        "progress": asdict(train_step.progress),
+        "bad_steps": train_step.guard.state(),
+        "tile_points": train_step.tiles.points,
         "num_threads": torch.get_num_threads(),
         "world_size": ranks.world_size(),
     }
@@ -50,21 +50,22 @@ def loops_after(steps: int) -> dict[str, Any]:
     fit: Any = _FitLoop(no_trainer)
     epoch, optimizer_steps = fit.epoch_loop, fit.epoch_loop.manual_optimization.optim_step_progress
     evaluation = epoch.val_loop.state_dict()
-    epoch._batches_that_stepped = steps
     for epochs in (fit.epoch_progress.total, fit.epoch_progress.current):
         epochs.ready = epochs.started = 1
     for batches in (epoch.batch_progress.total, epoch.batch_progress.current):
         batches.ready = batches.started = batches.processed = batches.completed = steps
     for taken in (optimizer_steps.total, optimizer_steps.current):
         taken.ready = taken.completed = steps
-    states = fit.state_dict(), evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
+    state = fit.state_dict()
+    state["epoch_loop.state_dict"]["_batches_that_stepped"] = steps  # what Lightning numbers its own log by
+    states = state, evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
     return dict(zip(LOOPS, states, strict=True))
 
 
-def restore_run(state: Mapping[str, Any], step: TrainStep, device: torch.device) -> None:
+def restore_run(state: Mapping[str, Any], train_step: TrainStep, device: torch.device) -> None:
     """Take a run up where `run_state` left it; a sum's last bits depend on the number of threads."""
-    step.progress.take_up(Progress(**state["progress"]))
-    step.guard.restore(state["bad_steps"], device)
+    train_step.progress.take_up(Progress(**state["progress"]))
+    train_step.guard.restore(state["bad_steps"], device)
     if state["world_size"] == ranks.world_size():
         use_threads(state["num_threads"])
 

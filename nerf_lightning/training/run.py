@@ -61,16 +61,16 @@ def assemble(
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
-    step = build_step(config, settings, scene, progress, start, model, loss)
+    train_step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
         log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
-    loss = step.objective.loss
+    loss = train_step.objective.loss
     if loss.depth_every:
         record["depths"] = depth_sums(scene)
-    step.new_optimizer()  # what it refuses is refused before a folder is taken
+    train_step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=loss.patch, depth_every=loss.depth_every
     )
     if ranks.is_first():
         build(config.quick_checks)(scene)
-    return Run(settings, scene, data, RadianceFieldSystem(step, record, config.resume_changed_capture))
+    return Run(settings, scene, data, RadianceFieldSystem(train_step, record, config.resume_changed_capture))

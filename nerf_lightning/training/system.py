@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.optim import Optimizer
@@ -16,17 +16,17 @@ from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
-from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
+from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run, require_fitting
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.resume import require_resumable, restore_run, run_state
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
-from nerf_lightning.training.steps_in_a_row import StepsInARow, logs_for
+from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.step_guard import first_not_finite
 from nerf_lightning.training.validation import RayErrors
 
 
@@ -37,17 +37,17 @@ class RadianceFieldSystem(LightningModule):
     reaches callbacks as `outputs["step"]` of `on_train_batch_end` (`StepOutput`).
 
     Args:
-        step: takes the steps.
+        train_step: takes the steps.
         record: what a checkpoint needs to be used alone (config text, cameras, bounds).
         resume_changed_capture: go on from a checkpoint of a capture that has changed, and warn.
     """
 
-    def __init__(self, step: TrainStep, record: dict[str, Any], resume_changed_capture: bool = False):
+    def __init__(self, train_step: TrainStep, record: dict[str, Any], resume_changed_capture: bool = False):
         super().__init__()
         self.automatic_optimization = False
-        self.step, self.record, self.resume_changed_capture = step, record, resume_changed_capture
+        self.train_step, self.record, self.resume_changed_capture = train_step, record, resume_changed_capture
         # Modules of the step are this module's, so that they move to the trainer's device and are saved.
-        objective = step.objective
+        objective = train_step.objective
         self.model, self.rays = objective.model, objective.rays
         self.correction, self.loss = objective.correction, objective.loss
         self.val_errors = RayErrors()
@@ -85,7 +85,7 @@ class RadianceFieldSystem(LightningModule):
         Raises:
             InputError: a setting of the optimizer that it refuses.
         """
-        return self.step.new_optimizer()
+        return self.train_step.new_optimizer()
 
     def on_fit_start(self) -> None:
         """Take the length of the run from the trainer, and record its steps where that was asked for and is possible.
@@ -93,43 +93,31 @@ class RadianceFieldSystem(LightningModule):
         Raises:
             InputError: it has none, or its steps cannot be recorded.
         """
-        self.step.num_steps = length_of_run(self.trainer, self.step.progress)
-        self.step.begin_recording()
-        self.in_a_row = StepsInARow(self.trainer, self)
+        self.train_step.num_steps = length_of_run(self.trainer, self.train_step.progress)
+        self.train_step.begin_recording()
 
     def on_fit_end(self) -> None:
-        """Forget the trainer and what was recorded: copies and pickles of the system are without them."""
-        del self.in_a_row
-        self.step.recorded = None
+        """Forget what was recorded: copies and pickles of the system are without it."""
+        self.train_step.gradients = self.train_step.tiles
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
 
-        Where steps are replayed, it goes on until somebody looks at one (`StepsInARow`).
-
         Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
         """
-        seen, taken = self._take_step(batch), 1
-        while self.in_a_row.another(taken):
-            seen, taken = self._take_step(self.in_a_row.batch()), taken + 1
+        callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        watched = any(isinstance(each, Monitor) and each.wants_gradients(self.trainer, self) for each in callbacks)
+        seen = self.train_step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen.losses.sum()
-        if not logs_for(self.trainer):
+        if not any(isinstance(each, Monitor | TrainingProgress) for each in callbacks):
             # What is on a bar is read in each step, for which the device is waited for.
             on_bar = self.trainer.progress_bar_callback is not None
             self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=on_bar)
         return {"loss": loss, "step": seen}
 
-    def _take_step(self, batch: Batch) -> StepOutput:
-        watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
-        return self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
-
-    def monitors(self) -> list[Monitor]:
-        """Return the callbacks that log scalars."""
-        return [each for each in self.trainer.callbacks if isinstance(each, Monitor)]  # type: ignore[attr-defined]
-
     def validation_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Collect the squared error of fixed rays; return its mean over the batch as `loss`, and the `psnr` (dB)."""
-        loss = self.val_errors.of(self.step.objective, batch, self.step.tiles.points)
+        loss = self.val_errors.of(self.train_step.objective, batch, self.train_step.tiles.points)
         return {"loss": loss, "psnr": psnr(loss)}
 
     def on_validation_epoch_end(self) -> None:
@@ -153,7 +141,7 @@ class RadianceFieldSystem(LightningModule):
             InputError: the batch is no whole view.
         """
         picture = self.predict_step(batch, batch_index)
-        behind = background_colors(self.step.objective.background, 1, torch.device("cpu"), random=None)
+        behind = background_colors(self.train_step.objective.background, 1, torch.device("cpu"), random=None)
         kept = batch.weight.cpu() > 0
         values = image_metrics(picture.rgb, blend(batch.rgba.cpu(), behind), None if bool(kept.all()) else kept)
         known = {name: value for name, value in values.items() if value is not None}
@@ -172,8 +160,8 @@ class RadianceFieldSystem(LightningModule):
                 "Trainer.predict datamodule=run.data, or its test_dataloader()."
             )
         view = int(batch.pixels.view[0, 0])
-        tile_points = self.step.tiles.points or WHOLE_BATCH_POINTS
-        return render_picture(self.model, self.rays, view, self.step.objective.background, tile_points)
+        background, tile_points = self.train_step.objective.background, self.train_step.tiles.picture_points
+        return render_picture(self.model, self.rays, view, background, tile_points)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what makes the file self-contained, and the run's state beyond weights and optimizer.
@@ -181,7 +169,7 @@ class RadianceFieldSystem(LightningModule):
         Raises:
             InputError: the weights are not finite.
         """
-        if self.step.broken_weights():
+        if first_not_finite(self.train_step.objective.named_weights()):
             raise InputError(
                 f"The weights of step {self.trainer.global_step} are not finite numbers, so they are not saved. The "
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
@@ -192,7 +180,7 @@ class RadianceFieldSystem(LightningModule):
     def kept_record(self) -> dict[str, Any]:
         """Return what makes a checkpoint self-contained, and the run's state beyond weights and optimizer."""
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
-        return self.record | run_state(self.step) | ({} if refined is None else {"refined": dict(vars(refined))})
+        return self.record | run_state(self.train_step) | ({} if refined is None else {"refined": dict(vars(refined))})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check what Lightning is about to restore, and restore the rest of the run.
@@ -200,7 +188,7 @@ class RadianceFieldSystem(LightningModule):
         Raises:
             InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
         """
-        trainer, step, path = self.trainer, self.step, Path(self.trainer.ckpt_path or LAST)
+        trainer, train_step, path = self.trainer, self.train_step, Path(self.trainer.ckpt_path or LAST)
         if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # Lightning's own has checked nothing
             content = read_content(path)
             checkpoint.clear()
@@ -213,9 +201,9 @@ class RadianceFieldSystem(LightningModule):
             path,
             weights=self.state_dict(),
             optimizer=self.configure_optimizers(),
-            build=step.build_optimizer,
+            build=train_step.build_optimizer,
             callbacks=trainer.callbacks,  # type: ignore[attr-defined]
             loops={key: getattr(trainer, key).state_dict() for key in LOOPS},
-            progress=step.progress,
+            progress=train_step.progress,
         )
-        restore_run(state, step, self.device)
+        restore_run(state, train_step, self.device)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.models.ragged_level import average_counts
+from nerf_lightning.nerf.part import reset_statistics
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -26,22 +27,24 @@ FEW_RAYS = 16
 log = logging.getLogger(__name__)
 
 
-def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> tuple[int, float | None]:
+def measured_tile(settings: TrainerSettings, train_step: TrainStep, batches: RayBatches) -> tuple[int, float | None]:
     """Return the best of a few tile sizes, and about how many seconds a step takes with it.
 
     By training steps that are thrown away; a few seconds at most. None: the tile is known without.
     """
-    step.to(settings.device)
-    if step.model.takes_whole_rays(step.device, training=True, learns_cameras=step.rays.learns_cameras):
+    train_step.objective.to(settings.device)
+    model, learns_cameras = train_step.objective.model, train_step.objective.rays.learns_cameras
+    if model.takes_whole_rays(train_step.device, training=True, learns_cameras=learns_cameras):
         return WHOLE_RAYS_TILE, None
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
-    num_rays = _rays_in_time(settings, step, batch)
-    points = num_rays * step.model.points_per_ray(training=True)
+    num_rays = _rays_in_time(settings, train_step, batch)
+    points = num_rays * model.points_per_ray(training=True)
     tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES
     enough = next((number for number, tile in enumerate(tiles) if tile >= points), len(tiles))
     # Larger ones than the first that takes all points at once would be the same.
-    best, seconds = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, step, batch, num_rays, tile))
-    step.reset_statistics()
+    best, seconds = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, train_step, batch, num_rays, tile))
+    train_step.objective.zero_grad(set_to_none=True)
+    reset_statistics(train_step.objective)
     log.info("tiles of %d points are the fastest of those measured", best)
     return best, seconds * batch.num_rays / num_rays
 
@@ -67,19 +70,19 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> tuple[int,
     return best, best_seconds
 
 
-def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> int:
-    _seconds(settings, step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
-    average_counts(step.model)  # how many samples rays have is known from here on
+def _rays_in_time(settings: TrainerSettings, train_step: TrainStep, batch: Batch) -> int:
+    _seconds(settings, train_step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
+    average_counts(train_step.objective.model)  # how many samples rays have is known from here on
     # Grown, not extrapolated: a tile of few rays says little of one of many, and too few rays make all tiles alike.
     rays = min(batch.num_rays, 4 * FEW_RAYS)
-    seconds = _seconds(settings, step, batch, rays, CPU_TILES[0])
+    seconds = _seconds(settings, train_step, batch, rays, CPU_TILES[0])
     while rays < batch.num_rays and 4.0 * seconds <= LONGEST_SECONDS:
         rays = min(batch.num_rays, 4 * rays)
-        seconds = _seconds(settings, step, batch, rays, CPU_TILES[0])
+        seconds = _seconds(settings, train_step, batch, rays, CPU_TILES[0])
     return max(FEW_RAYS, min(rays, int(rays * LONGEST_SECONDS / seconds)))
 
 
-def _seconds(settings: TrainerSettings, step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
-    step.tiles.points = tile
+def _seconds(settings: TrainerSettings, train_step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
+    train_step.tiles.points = tile
     some = batch[:num_rays]
-    return seconds_of(lambda: step.gradients(some))
+    return seconds_of(lambda: train_step.gradients(some, train_step.key))

@@ -20,10 +20,10 @@ def test_a_gpu_that_fails_in_a_step_ends_with_the_way_to_go_on(
 ):
     take = TrainStep.__call__
 
-    def fail_once(step, *given, **options):
-        if step.progress.step == failing_step:
+    def fail_once(train_step, *given, **options):
+        if train_step.progress.step == failing_step:
             raise kind(FAILURES[kind])
-        return take(step, *given, **options)
+        return take(train_step, *given, **options)
 
     monkeypatch.setattr(TrainStep, "__call__", fail_once)
     result = train("trainer.max_steps=10", "final.evaluate=false", "final.video=false")

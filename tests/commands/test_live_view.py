@@ -105,7 +105,7 @@ class Clock:
 
 
 class FakeSystem:
-    step = SimpleNamespace(num_steps=1)
+    train_step = SimpleNamespace(num_steps=1)
 
     def eval(self):
         pass

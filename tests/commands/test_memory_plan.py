@@ -38,6 +38,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.part import reset_statistics
 
 TILE = int(sys.argv[3])
 THREADS = int(sys.argv[4])
@@ -60,33 +61,34 @@ def most(work):
 
 def built():
     progress = Progress()
-    step = build_step(config, settings, scene, progress)
-    settings.prepare(step.model)
-    step.tiles.points, step.num_steps = TILE, 10
-    return step, build(config.data)(scene=scene, progress=progress, seed=0)
+    train_step = build_step(config, settings, scene, progress)
+    settings.prepare(train_step.objective.model)
+    train_step.tiles.points, train_step.num_steps = TILE, 10
+    return train_step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 
-def warm(step, batches):
+def warm(train_step, batches):
     "Load libraries and kernels, which are in no plan."
     few = batches.at(0, 0)[:8]
-    step.gradients(few)
+    train_step.gradients(few, train_step.key)
     with torch.no_grad():
-        step.model(step.rays(few.pixels), None, None)
+        train_step.objective.model(train_step.objective.rays(few.pixels), None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
-    step.reset_statistics()
-    average_counts(step.model)
+    train_step.objective.zero_grad(set_to_none=True)
+    reset_statistics(train_step.objective)
+    average_counts(train_step.objective.model)
 
 
 def train():
     for _ in range(2):
         batches.progress.batch_rays = batches.progress.largest_batch
-        step(batches.at(0, batches.progress.rays_seen), optimizer)
+        train_step(batches.at(0, batches.progress.rays_seen), optimizer)
 
 
 def evaluate():
-    step.model.eval()
+    train_step.objective.model.eval()
     with torch.no_grad():
-        picture = render_picture(step.model, step.rays, 0, "white", TILE)
+        picture = render_picture(train_step.objective.model, train_step.objective.rays, 0, "white", TILE)
         image_metrics(picture.rgb, picture.rgb)
 
 
@@ -96,9 +98,9 @@ settings = build(config.trainer)
 settings.prepare_machine()
 scene = ball_scene(num_views=6, size=320, background="random")
 settings.tile_points = TILE
-step, data = built()
-batches, optimizer = data.batches, step.new_optimizer()
-warm(step, batches)
+train_step, data = built()
+batches, optimizer = data.batches, train_step.new_optimizer()
+warm(train_step, batches)
 measured = most(lambda: (train(), evaluate()))
 plan = memory_plan(settings, *built())
 print(plan)
@@ -162,10 +164,10 @@ def built_for(name, threads, tile):
     config = composed("train", f"model={name}", "trainer.accelerator=cpu", f"trainer.tile_points={tile}")
     views = 24 if name.startswith("view_transformer") else 4  # each is rendered from up to ten others
     scene, progress, settings = ball_scene(num_views=views, size=32), Progress(), build(config.trainer)
-    step = build_step(config, settings, scene, progress)
-    settings.prepare(step.model)
-    step.num_steps = 10
-    return settings, step, build(config.data)(scene=scene, progress=progress, seed=0)
+    train_step = build_step(config, settings, scene, progress)
+    settings.prepare(train_step.objective.model)
+    train_step.num_steps = 10
+    return settings, train_step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 
 def test_tiles_beside_each_other_are_there_at_once():
@@ -207,10 +209,10 @@ def announced(monkeypatch, caplog, level, free):
     plan = MemoryPlan([Row("pixels", 10**9, "memory")], [Row("a step", 2 * 10**9, "memory")], free=free)
     monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
     monkeypatch.setattr(memory_plan, "at_most", lambda *parts: 10**15)
-    settings, step, data = (kind.__new__(kind) for kind in (TrainerSettings, TrainStep, RayDataModule))
+    settings, train_step, data = (kind.__new__(kind) for kind in (TrainerSettings, TrainStep, RayDataModule))
     settings.device_type = "cpu"
     with caplog.at_level(level, "nerf_lightning"):
-        memory_plan.announce_memory(settings, step, data)
+        memory_plan.announce_memory(settings, train_step, data)
     return str(plan).splitlines(), caplog.messages
 
 

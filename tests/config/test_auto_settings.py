@@ -324,7 +324,7 @@ def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
     for doctor, learnt in (("on", True), ("off", False)):
         overrides = [*FAST, f"doctor={doctor}", "trainer.precision=32-true"]
         parts = assemble_job(*compose_config("train", overrides), overrides)
-        assert (parts.system.step.objective.correction is not None) == learnt
+        assert (parts.system.train_step.objective.correction is not None) == learnt
         assert parts.system.record["choices"]["correction"] == ("exposure" if learnt else "none")
 
 

@@ -177,10 +177,10 @@ def test_tiles_add_up_with_distances():
 
     found = []
     for tile_points in (None, 200):
-        step = make_step(tile_points)
-        step.objective.loss = DepthLoss(every=4, beside=1.0)
-        batch = RayBatches(scene_with_depths(), step.progress, 0, 64, depth_every=4).at(0, 0)
-        seen = step.gradients(batch)
+        train_step = make_step(tile_points)
+        train_step.objective.loss = DepthLoss(every=4, beside=1.0)
+        batch = RayBatches(scene_with_depths(), train_step.progress, 0, 64, depth_every=4).at(0, 0)
+        seen = train_step.gradients(batch, train_step.key)
         found.append(seen.losses)
         # What is seen from beside the cameras is compared with no photograph, by nobody.
         assert torch.equal(seen.weight == 0, batch.certainty > 0)

@@ -45,7 +45,7 @@ def never_waiting(device):
 
 def updates(run) -> set[int]:
     """The steps in which a grid is updated, and read (one of `MaskedLevel` at its first time alone)."""
-    levels = [level for level in run.training.model.modules() if isinstance(level, RaggedLevel | MaskedLevel)]
+    levels = [level for level in run.training.objective.model.modules() if isinstance(level, RaggedLevel | MaskedLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 
@@ -107,17 +107,17 @@ class Watch(Callback):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("resident", [True, False])
 def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, resident, device, tmp_path):
-    step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *METHODS[method]).training
+    train_step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *METHODS[method]).training
     settings = TrainerSettings(
         max_steps=STEPS, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=STEPS
     )
-    system = RadianceFieldSystem(step, {})
-    settings.prepare(step.model)
+    system = RadianceFieldSystem(train_step, {})
+    settings.prepare(train_step.objective.model)
     watch = Watch(device)
     quiet = [each for each in default_callbacks() if type(each).__name__ in ("CollapseGuard", "NanGuard", "Monitor")]
     trainer = settings.build(tmp_path, STEPS, [*quiet, watch], [])
     budget = "auto" if resident else 0
-    data = RayDataModule(ball_scene(), step.progress, 0, batch_rays=96, val_rays=96, device_budget=budget)
+    data = RayDataModule(ball_scene(), train_step.progress, 0, batch_rays=96, val_rays=96, device_budget=budget)
     with warnings.catch_warnings(record=True) as watch.caught:
         warnings.simplefilter("always")
         trainer.fit(system, data)

@@ -4,11 +4,13 @@ import pytest
 import torch
 from support.configs import options
 from support.gpu_training import step_by_step
+from support.tape import replay_steps
 
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out, gradient_bound
 from nerf_lightning.selftest.training import METHODS
+from nerf_lightning.training.gradients.recorded import cuda_graph
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 STEPS, TILE_POINTS = 50, 8192
@@ -54,7 +56,7 @@ def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, de
 @pytest.mark.filterwarnings("ignore:Dynamo does not know how to trace:UserWarning")
 def test_compiled_fields_compute_the_same(cuda):
     made = training.Training("nerf_tiny", cuda, "float32", None)
-    assert made.step.model.compile_fields()
+    assert made.train_step.objective.model.compile_fields()
     apart = training.gradients_apart(made.gradients(), training.reference_gradients("nerf_tiny"))
     assert apart < gradient_bound("float32", training.LAYERS)
 
@@ -63,7 +65,7 @@ def test_compiled_fields_compute_the_same(cuda):
 def test_replayed_steps_learn_what_steps_learn(model, cuda):
     """But for the order of sums, which a GPU leaves to chance."""
     runs = [step_by_step(model, cuda) for _ in range(2)]
-    runs[1].training.record_gradients()
+    replay_steps(runs[1].training, cuda_graph)
     for run in runs:
         for _ in range(STEPS):
             run.step()

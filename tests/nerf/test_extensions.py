@@ -26,6 +26,7 @@ from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.part import fit_parts, statistics
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.video.film import film
 from nerf_lightning.video.settings import FilmSettings
@@ -48,24 +49,27 @@ def a_step(overrides) -> TrainStep:
     config, scene = composed("train", SEARCHED, *overrides), ball_scene(num_views=8, size=16, background="random")
     model = build(config.model)
     fit_parts(model, scene)
-    return TrainStep(
+    train_step = TrainStep(
         Objective(model, rays_of(scene), build(config.loss), "random"),
         lambda groups: torch.optim.Adam(groups, lr=2e-2), ExponentialDecay(decay_rate=1.0), Progress(), 0, 4096,
         num_steps=100,
     )  # fmt: skip
+    draw_weights(train_step)
+    return train_step
 
 
 @pytest.mark.parametrize("added", ADDED)
 def test_it_learns_renders_and_is_saved(added):
     scene = ball_scene(num_views=8, size=16, background="random")
-    step = a_step(ADDED[added])
-    loader, optimizer = RayBatches(scene, step.progress, 0, 96, patch=step.objective.loss.patch), step.new_optimizer()
-    losses = [step(loader.at(0, step.progress.rays_seen), optimizer).losses[-1] for _ in range(35)]
+    train_step = a_step(ADDED[added])
+    loader = RayBatches(scene, train_step.progress, 0, 96, patch=train_step.objective.loss.patch)
+    optimizer = train_step.new_optimizer()
+    losses = [train_step(loader.at(0, train_step.progress.rays_seen), optimizer).losses[-1] for _ in range(35)]
     assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
-    assert step.guard.skipped == 0
-    again = a_step(ADDED[added])
-    again.model.load_state_dict(step.model.state_dict())
-    ours, theirs = (render_picture(each.model.eval(), each.rays, 0, "white", 4096) for each in (step, again))
+    assert train_step.guard.skipped == 0
+    objective, again = train_step.objective, a_step(ADDED[added]).objective
+    again.model.load_state_dict(objective.model.state_dict())
+    ours, theirs = (render_picture(each.model.eval(), each.rays, 0, "white", 4096) for each in (objective, again))
     assert torch.equal(ours.rgb, theirs.rgb)
 
 
@@ -73,19 +77,19 @@ def test_it_learns_renders_and_is_saved(added):
 def test_the_penalty_of_an_encoder_inside_the_model_reaches_its_gradients_once(tile_points):
     scene, gradients = ball_scene(num_views=8, size=16, background="random"), []
     for weight in (0.0, 1.0):
-        step = a_step([*ADDED["an encoder with a penalty"], f"encoder.total_variation={weight}"])
-        step.tiles.points = tile_points
-        step.gradients(RayBatches(scene, step.progress, 0, 96).at(0, 0))
-        gradients.append(step.model.last.field.position_encoder.planes.grad)
-    encoder = step.model.last.field.position_encoder
+        train_step = a_step([*ADDED["an encoder with a penalty"], f"encoder.total_variation={weight}"])
+        train_step.tiles.points = tile_points
+        train_step.gradients(RayBatches(scene, train_step.progress, 0, 96).at(0, 0), train_step.key)
+        gradients.append(train_step.objective.model.last.field.position_encoder.planes.grad)
+    encoder = train_step.objective.model.last.field.position_encoder
     (expected,) = torch.autograd.grad(encoder.penalty(), [encoder.planes])
     assert float(expected.abs().max()) > 1e-4
     torch.testing.assert_close(gradients[1] - gradients[0], expected, rtol=1e-3, atol=1e-6)
 
 
 def test_each_term_of_a_weighted_sum_is_told_apart_and_their_sum_is_minimised():
-    scene, step = ball_scene(num_views=8, size=16), a_step(ADDED["a structural loss beside the squared error"])
-    seen = step.gradients(RayBatches(scene, step.progress, 0, 96, patch=4).at(0, 0))
+    scene, train_step = ball_scene(num_views=8, size=16), a_step(ADDED["a structural loss beside the squared error"])
+    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 96, patch=4).at(0, 0), train_step.key)
     assert list(seen.terms) == ["mse", "dssim"]
     assert float(seen.terms["dssim"].min()) > 0
     torch.testing.assert_close(seen.losses, seen.terms["mse"] + seen.terms["dssim"])
@@ -93,12 +97,14 @@ def test_each_term_of_a_weighted_sum_is_told_apart_and_their_sum_is_minimised():
 
 
 def test_a_channel_is_trained_rendered_filmed_and_exported_without_being_listed(tmp_path):
-    scene, step = ball_scene(num_views=8, size=16, background="black"), a_step(ADDED["a semantic channel"])
-    loader, optimizer = RayBatches(scene, step.progress, 0, 96), step.new_optimizer()
-    terms = [step(loader.at(0, step.progress.rays_seen), optimizer).terms["bright"].sum() for _ in range(40)]
+    scene, train_step = ball_scene(num_views=8, size=16, background="black"), a_step(ADDED["a semantic channel"])
+    loader, optimizer = RayBatches(scene, train_step.progress, 0, 96), train_step.new_optimizer()
+    terms = [
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer).terms["bright"].sum() for _ in range(40)
+    ]
     assert float(torch.stack(terms[-5:]).mean()) < 0.9 * float(torch.stack(terms[:5]).mean())
-    model = step.model.eval()
-    seen = render_picture(model, step.rays, 0, "black", 4096)
+    model = train_step.objective.model.eval()
+    seen = render_picture(model, train_step.objective.rays, 0, "black", 4096)
     assert seen.channels["bright"].shape == (16, 16, 2)
     torch.testing.assert_close(seen.channels["bright"].sum(dim=-1), seen.opacity)
     record, shown = scene_record(scene), FilmSettings(outputs=("rgb", "bright"), form="frames")
@@ -121,14 +127,14 @@ def test_a_weighted_sum_refuses_what_does_not_fit():
 
 
 def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
-    step = a_step(ADDED["a packed sampler without a grid"])
-    torch.nn.init.normal_(step.model.last.field.position_encoder.table)
-    rays = step.rays(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0).pixels)
-    whole = step.model(rays, torch.ones(64, 3), None)[0]
+    train_step = a_step(ADDED["a packed sampler without a grid"])
+    torch.nn.init.normal_(train_step.objective.model.last.field.position_encoder.table)
+    rays = train_step.objective.rays(RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0).pixels)
+    whole = train_step.objective.model(rays, torch.ones(64, 3), None)[0]
     with torch.no_grad():
-        walked = step.model(rays, torch.ones(64, 3), None)[0]
+        walked = train_step.objective.model(rays, torch.ones(64, 3), None)[0]
     torch.testing.assert_close(walked.rgb, whole.rgb.detach(), atol=2e-3, rtol=0)
-    assert "train/occupied" not in statistics(step.model)
+    assert "train/occupied" not in statistics(train_step.objective.model)
 
 
 def test_a_table_of_cameras_is_a_capture(tmp_path):

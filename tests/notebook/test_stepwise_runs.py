@@ -13,7 +13,8 @@ from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning as nl
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
-from nerf_lightning.training.step import TrainStep
+from nerf_lightning.notebook import run as notebook_run
+from nerf_lightning.training.callbacks import nan_guard
 
 SMALL = ("model=nerf_tiny", "trainer=cpu", "data.batch_rays=64", "data.crop_steps=3")
 
@@ -118,11 +119,12 @@ def test_the_guards_restart_a_collapsed_run_and_end_a_broken_one(pinholes, monke
     run = nl.build_run(*SMALL, scene=pinholes)
     guard = run.collapse_guard
     guard.every_steps, guard.patience, guard.ratio = 1, 2, 1e9
-    counted = [(metrics["step"], run.system.step.progress.attempt) for metrics in run.steps(5)]
+    counted = [(metrics["step"], run.system.train_step.progress.attempt) for metrics in run.steps(5)]
     assert counted == [(1, 0), (2, 1), (3, 1), (4, 2), (5, 2)]
     broken = nl.build_run(*SMALL, scene=pinholes)
     broken.nan_guard.patience = 3
-    monkeypatch.setattr(TrainStep, "broken_weights", lambda step: "fine.field")
+    for module in (nan_guard, notebook_run):
+        monkeypatch.setattr(module, "first_not_finite", lambda named: "fine.field")
     broken.nan_guard.every_steps = 2
     refused(lambda: list(broken.steps(9)), parts=("step 2", "fine.field", "run stops", "optimizer.lr"))
     refused(broken.save, "never.ckpt", parts=("fine.field", "not saved"))

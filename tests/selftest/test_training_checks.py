@@ -87,7 +87,7 @@ torch.nn.Module.compile = lambda field, **how: compile_it(field, backend="eager"
 for products in ("float32", "tf32", "bfloat16"):
     torch._dynamo.reset()
     made = training.Training("nerf_tiny", training.CPU, products, None)
-    assert made.step.model.compile_fields()
+    assert made.train_step.objective.model.compile_fields()
     made.gradients()
 print(dict(torch._dynamo.utils.counters["graph_break"]))
 """

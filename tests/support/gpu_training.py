@@ -59,12 +59,13 @@ def step_by_step(
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     looks = model.startswith("view_transformer")  # at up to ten photographs for each view
     scene, progress = many_views(24) if looks else ball_scene(), Progress()
-    training = build_step(config, settings, scene, progress).to(device)
+    training = build_step(config, settings, scene, progress)
+    training.objective.to(device)
     training.num_steps = 1000
-    for level in training.model.modules():
+    for level in training.objective.model.modules():
         if isinstance(level, RaggedLevel):
             level.sampler.opaque_below = 0.0  # GPUs cut off no samples, and the losses are compared
-    set_precision(training.model, PRODUCTS[precision])
+    set_precision(training.objective.model, PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
     return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))
 

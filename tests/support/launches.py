@@ -16,6 +16,7 @@ import torch
 import triton
 from support.gpu_training import small, step_by_step
 from support.stand_in_device import StandInDevice, lies_there
+from support.tape import replay_steps
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
@@ -130,7 +131,7 @@ def replayed(model: str, precision: str) -> tuple[list[str], dict[str, int]]:
             read.update(noted)
             return lambda: None, seen
 
-        run.training.record_gradients(record=record)
+        replay_steps(run.training, record)
         for _ in range(8):  # across updates of grids
             launches.counts.clear()
             run.step()
@@ -147,10 +148,10 @@ def measured(model: str, precision: str) -> dict[str, Any]:
             launches.counts.clear()
             run.step()
         step, losses = dict(launches.counts), run.all_losses().tolist()
-        rays = run.training.rays(run.loader.at(0, 0).pixels)
+        rays = run.training.objective.rays(run.loader.at(0, 0).pixels)
         launches.counts.clear()
         with torch.no_grad():
-            run.training.model.eval()(rays, torch.ones_like(rays.origins), None)
+            run.training.objective.model.eval()(rays, torch.ones_like(rays.origins), None)
         tile = dict(launches.counts)
         with backends.without(*backends.CUDA_BACKENDS):
             run = step_by_step(model, there.device, precision, None, *changes)

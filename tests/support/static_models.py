@@ -17,6 +17,7 @@ from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
@@ -49,7 +50,7 @@ def static_system(name: str, scene, progress, num_steps: int, model=None, loss=N
     """The system that trains one of the two models on whole batches."""
     model = model or MODELS[name]()
     fit_parts(model, scene)
-    step = TrainStep(
+    train_step = TrainStep(
         objective=Objective(model, rays_of(scene), loss or MeanSquaredError(), scene.background),
         optimizer=OPTIMIZERS[name],
         schedule=ExponentialDecay(decay_rate=0.1),
@@ -58,4 +59,5 @@ def static_system(name: str, scene, progress, num_steps: int, model=None, loss=N
         seed=0,
         clip_norm=1.0,
     )
-    return RadianceFieldSystem(step, {"scene": {"splits": {"train": list(scene.splits["train"])}}})
+    draw_weights(train_step)
+    return RadianceFieldSystem(train_step, {"scene": {"splits": {"train": list(scene.splits["train"])}}})

@@ -9,6 +9,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 
 
@@ -29,7 +30,7 @@ def rays_of(scene) -> RayGenerator:
 
 def make_step(tile_points, model=None, background="white", clip_norm=None, seed=0, sample_budget=None):
     """The step of a tiny model on the ball, whose weights nothing moves."""
-    return TrainStep(
+    train_step = TrainStep(
         objective=Objective(
             model or tiny_model(density_bias=0.5), rays_of(ball_scene()), MeanSquaredError(), background
         ),
@@ -42,11 +43,13 @@ def make_step(tile_points, model=None, background="white", clip_norm=None, seed=
         clip_norm=clip_norm,
         sample_budget=sample_budget,
     )
+    draw_weights(train_step)
+    return train_step
 
 
-def gradients(step, scene, steps=1):
+def gradients(train_step, scene, steps=1):
     """The gradients and the losses of the last of some steps."""
-    loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
+    loader, optimizer = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer()
     for _ in range(steps):
-        seen = step(loader.at(0, step.progress.rays_seen), optimizer)
-    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen.losses
+        seen = train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+    return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen.losses

@@ -6,7 +6,7 @@ depends on the data, is refused.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partialmethod
+from functools import partial
 
 import pytest
 import torch
@@ -16,6 +16,8 @@ from torch.utils._pytree import tree_leaves
 
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
+from nerf_lightning.training import step
+from nerf_lightning.training.gradients.recorded import RecordedGradients
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
@@ -54,6 +56,11 @@ def tape(work):
     return recorded.replay, seen
 
 
+def replay_steps(train_step: TrainStep, record=tape) -> None:
+    """Record steps from now on, and replay them."""
+    train_step.gradients = RecordedGradients(train_step.tiles, train_step.guard, record)
+
+
 @contextmanager
 def steps_on_tape() -> Iterator[list[int]]:
     """Let every command record its steps, with torch in place of the kernels; return a number for each replay."""
@@ -64,6 +71,6 @@ def steps_on_tape() -> Iterator[list[int]]:
         return lambda: (replays.append(len(replays)), replay()), seen
 
     with without(*CPU_BACKENDS), torch_on_one_thread(shares_out=False), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TrainerSettings, "records", lambda settings, step: True)
-        patch.setattr(TrainStep, "record_gradients", partialmethod(TrainStep.record_gradients, record=noted))
+        patch.setattr(TrainerSettings, "records", lambda settings, train_step: True)
+        patch.setattr(step, "RecordedGradients", partial(RecordedGradients, record=noted))
         yield replays

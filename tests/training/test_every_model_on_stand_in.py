@@ -61,7 +61,7 @@ def step_and_render(there, run, waits):
         else:
             with there.in_step(*waits):
                 run.step()
-    render_picture(run.training.model.eval(), run.training.rays, 0, "white", 1 << 14)
+    render_picture(run.training.objective.model.eval(), run.training.objective.rays, 0, "white", 1 << 14)
     assert bool(run.all_losses().isfinite().all())
 
 
@@ -78,7 +78,7 @@ def losses_on_the_cpu(model):
 def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
     with StandInDevice("cuda") as there, backends.without("hash_grid.cuda", "mlp.cuda"):
         run = run_on(there, model, precision)
-        waits = named_waits(run.training.model)
+        waits = named_waits(run.training.objective.model)
         step_and_render(there, run, (*waits, SENT))
     assert there.waited.pop(SENT, 0) <= PHOTOGRAPHS
     assert there.waited == waits
@@ -94,7 +94,7 @@ def test_every_model_trains_and_renders_on_mps(model):
         run = run_on(there, model, "32-true")
         for _ in range(UPDATED):
             run.step()
-        render_picture(run.training.model.eval(), run.training.rays, 0, "white", 1 << 14)
+        render_picture(run.training.objective.model.eval(), run.training.objective.rays, 0, "white", 1 << 14)
         assert bool(run.all_losses().isfinite().all())
 
 
@@ -147,7 +147,7 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
     monkeypatch.setattr(backends, "backend", known.get)
     with StandInDevice("cuda") as there:
         run = run_on(there, model, "bf16-mixed")
-        step_and_render(there, run, named_waits(run.training.model))
+        step_and_render(there, run, named_waits(run.training.objective.model))
     assert all(kernel.launched >= STEPS for pair in kernels.values() for kernel in pair)
 
 
@@ -157,9 +157,9 @@ def test_arrays_of_samples_hold_twice_what_a_step_is_made_to_have(model):
         budget = composed("train", f"model={model}").data.sample_budget
         given = f"data.sample_budget={'null' if budget is None else budget}"
         run = step_by_step(model, there.device, "32-true", None, *small(model), given)
-        (sampler,) = [part for part in run.training.model.modules() if isinstance(part, OccupancySampler)]
+        (sampler,) = [part for part in run.training.objective.model.modules() if isinstance(part, OccupancySampler)]
         pixels = run.loader.at(0, 0).pixels
-        few, many = (run.training.rays(pixels.map(lambda each, n=n: each.repeat(n))) for n in (1, 1 << 13))
+        few, many = (run.training.objective.rays(pixels.map(lambda each, n=n: each.repeat(n))) for n in (1, 1 << 13))
         assert sampler.capacity_for(many) == (1 << 20 if budget is None else 2 * budget)
         # No more than there are intervals, where those are fewer.
         assert sampler.capacity_for(few) == 8 * (sampler.lattice.numel() - 2)

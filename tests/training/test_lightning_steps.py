@@ -124,7 +124,7 @@ def test_what_a_subclass_of_somebody_saves_is_opened(tmp_path):
             self.save_hyperparameters("note")
 
     other = made_run(tmp_path)
-    system = Theirs(other.system.step, other.system.record)
+    system = Theirs(other.system.train_step, other.system.record)
     trainer = quiet(max_steps=1, logger=False, enable_progress_bar=False, default_root_dir=tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -135,7 +135,7 @@ def test_what_a_subclass_of_somebody_saves_is_opened(tmp_path):
     again = made_run(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        longer.fit(Theirs(again.system.step, again.system.record), again.data, ckpt_path=tmp_path / "theirs.ckpt")
+        longer.fit(Theirs(again.system.train_step, again.system.record), again.data, ckpt_path=tmp_path / "theirs.ckpt")
     assert longer.global_step == 2
 
 
@@ -155,13 +155,13 @@ def test_steps_of_a_trainer_of_ones_own_are_replayed(tmp_path):
     for records in (False, True):
         outputs, hooks = Outputs(), Hooks()
         with steps_on_tape() as replays, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(TrainerSettings, "records", lambda settings, step, records=records: records)
+            patch.setattr(TrainerSettings, "records", lambda settings, train_step, records=records: records)
             run = made_run(tmp_path)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 quiet(max_steps=4, limit_val_batches=0, callbacks=[outputs, hooks], **quietly).fit(run.system, run.data)
         assert len(replays) == 4 * records
         assert (hooks.updates, hooks.backwards > 0) == (4, not records)
-        assert run.system.step.recorded is None  # a system can be copied
+        assert not run.system.train_step.gradients.replays  # a system can be copied
         losses.append(torch.stack(outputs.train))
     assert torch.equal(*losses)

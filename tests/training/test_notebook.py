@@ -123,7 +123,7 @@ def test_what_the_package_offers_is_loaded_when_it_is_asked_for():
 def test_a_run_has_the_settings_of_nerf_train(run, capture):
     made = run("optimizer.lr=0.002", "seed=3")
     assert made.system.configure_optimizers().param_groups[0]["lr"] == 0.002
-    assert made.system.step.seed == 3
+    assert made.system.train_step.seed == 3
     assert made.data.scene.view_names == made.scene.view_names
     assert made.system.record["choices"]["model"] == "nerf_tiny"
     assert "batch_rays: 32" in made.system.record["config"]
@@ -156,7 +156,7 @@ def test_a_number_of_steps_is_the_length_of_the_run(run, trainer):
     one, lengths = run(), Lengths()
     fit = trainer(max_steps=10, callbacks=[lengths])
     fit.fit(one.system, one.data)
-    assert (fit.global_step, one.system.step.progress.step, one.system.step.num_steps) == (10, 10, 10)
+    assert (fit.global_step, one.system.train_step.progress.step, one.system.train_step.num_steps) == (10, 10, 10)
     assert lengths.rates == pytest.approx([5e-4 * 0.1 ** (step / 10) for step in range(10)])
     assert fit.callback_metrics["val/psnr"] > 0
 
@@ -175,7 +175,7 @@ def test_an_epoch_is_every_training_ray_once(run, trainer, settings, steps):
     assert len(one.data.batches.whole) == RAYS_OF_AN_EPOCH
     fit = trainer(**settings)
     fit.fit(one.system, one.data)
-    assert (one.system.step.progress.step, one.system.step.num_steps) == (steps, steps)
+    assert (one.system.train_step.progress.step, one.system.train_step.num_steps) == (steps, steps)
 
 
 def test_runs_without_end_and_on_several_devices_without_a_strategy_that_adds_once_are_refused(
@@ -236,7 +236,7 @@ def test_a_run_that_a_clock_ends_is_warned_of_its_learning_rate(run, trainer, ca
 def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, settings):
     whole, rest, found = whole_and_resumed(lambda: run(*settings, "scheduler=constant"), trainer, stop=12, steps=24)
     assert found.endswith("step=12.ckpt")
-    assert rest.system.step.progress.step == 24
+    assert rest.system.train_step.progress.step == 24
     assert_equal(rest, whole)
 
 
@@ -250,7 +250,7 @@ def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
     found = kept(first)
     assert found.endswith("step=10.ckpt")
     trainer(max_epochs=2, callbacks=[saves()]).fit(rest.system, rest.data, ckpt_path=found)
-    assert rest.system.step.progress.step == 12
+    assert rest.system.train_step.progress.step == 12
     assert_equal(rest, whole)
 
 
@@ -287,7 +287,9 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
     def with_learnt_cameras():
         made = run("scheduler=constant")
         cameras = made.scene.cameras, made.scene.near, made.scene.far
-        made.system.rays = made.system.step.objective.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
+        made.system.rays = made.system.train_step.objective.rays = LearntShifts(
+            *cameras, learning_rate=1e-3, weight=0.1
+        )
         return made
 
     whole, rest, found = whole_and_resumed(with_learnt_cameras, trainer, stop=5, steps=12)
@@ -339,7 +341,7 @@ def test_the_callbacks_of_nerf_train_work_there_too(run, trainer, capture, tmp_p
     one = run()
     fit = trainer(max_epochs=2, callbacks=[*watching, TimeBudget(60.0)], enable_progress_bar=True)
     fit.fit(one.system, one.data)
-    assert one.system.step.progress.step == 2 * STEPS_OF_AN_EPOCH
+    assert one.system.train_step.progress.step == 2 * STEPS_OF_AN_EPOCH
     assert (tmp_path / "root" / "images" / "validation" / "step_0000012.png").is_file()  # after the last step
 
 

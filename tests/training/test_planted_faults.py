@@ -29,21 +29,21 @@ def trained(scene, steps, *settings):
     config = composed("train", "model=fast_small", "trainer=cpu", "trainer.precision=32-true", *settings)
     trainer, progress = build(config.trainer), Progress()
     trainer.prepare_machine()
-    step = build_step(config, trainer, scene, progress)
-    step.tiles.points, step.num_steps = TILE, steps
-    data = build(config.data)(scene=scene, progress=progress, seed=0, patch=step.objective.loss.patch)
-    optimizer = step.new_optimizer()
+    train_step = build_step(config, trainer, scene, progress)
+    train_step.tiles.points, train_step.num_steps = TILE, steps
+    data = build(config.data)(scene=scene, progress=progress, seed=0, patch=train_step.objective.loss.patch)
+    optimizer = train_step.new_optimizer()
     for _ in range(steps):
-        step(data.batches.at(progress.attempt, progress.rays_seen), optimizer)
-    step.model.eval()
-    return step
+        train_step(data.batches.at(progress.attempt, progress.rays_seen), optimizer)
+    train_step.objective.model.eval()
+    return train_step
 
 
 @torch.no_grad()
-def quality(step, scene):
+def quality(train_step, scene):
     """PSNR on the test views of a scene, from where their cameras really are."""
-    rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
-    pictures = [(render_picture(step.model, rays_of, view, "white", TILE).rgb, view) for view in scene.splits["test"]]
+    model, rays_of = train_step.objective.model, RayGenerator(scene.cameras, scene.near, scene.far)
+    pictures = [(render_picture(model, rays_of, view, "white", TILE).rgb, view) for view in scene.splits["test"]]
     errors = [(rgb - photograph(scene, view, "white")).square().mean() for rgb, view in pictures]
     return float(psnr(torch.stack(errors)).mean())
 
@@ -52,10 +52,10 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
     """Of 1 degree and 1 % of the distance on each of 100 cameras, 0.15 degrees and 0.21 % were left."""
     true = bricks(128, views=100)
     scene = with_noise(true, degrees=1.0, share=0.01)
-    step = trained(scene, 2000, "data.batch_rays=2048", "refinement=se3", "encoder.blend_in=0.5")
+    train_step = trained(scene, 2000, "data.batch_rays=2048", "refinement=se3", "encoder.blend_in=0.5")
     before, after = (
         mean_errors(each.detach(), true.cameras.c2w, true.splits["train"])
-        for each in (scene.cameras.c2w, step.rays.cameras.c2w)
+        for each in (scene.cameras.c2w, train_step.objective.rays.cameras.c2w)
     )
     assert after[1] < before[1] / 5, "degrees"
     assert after[0] < before[0] / 4, "centers"

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from support.gpu_training import step_by_step
-from support.tape import tape
+from support.tape import replay_steps
 from support.two_processes import in_two_processes
 
 from nerf_lightning.compute import ranks
@@ -21,6 +21,7 @@ from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.training.attempts import restart
 from nerf_lightning.training.gradients.recorded import cuda_graph
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
@@ -41,10 +42,10 @@ def as_on_a_gpu(monkeypatch):
 def trained(sizes, record, model="fast_small", *changes):
     """Take a step of each size, and return the run."""
     run = step_by_step(model, CPU, "32-true", None, *(changes or SMALL))
-    for level in run.training.model.levels.values():
+    for level in run.training.objective.model.levels.values():
         level.returns_weights = True  # so that no kernel takes whole rays
     if record:
-        run.training.record_gradients(record=tape)
+        replay_steps(run.training)
     for size in sizes:
         run.training.progress.batch_rays = size
         run.step()
@@ -53,30 +54,31 @@ def trained(sizes, record, model="fast_small", *changes):
 
 def assert_same(run, other):
     torch.testing.assert_close(run.all_losses(), other.all_losses(), rtol=0, atol=0)
-    for name, value in run.training.model.state_dict().items():
-        torch.testing.assert_close(value, other.training.model.state_dict()[name], rtol=0, atol=0, msg=name)
+    for name, value in run.training.objective.model.state_dict().items():
+        torch.testing.assert_close(value, other.training.objective.model.state_dict()[name], rtol=0, atol=0, msg=name)
 
 
 def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_for_each_size_of_batches():
     sizes = [48] * 6
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert [size for size, _ in run.training.recorded.recordings] == [48]
-    assert statistics(run.training.model)["train/dropped_samples"] == 0
+    assert [size for size, _ in run.training.gradients.recordings] == [48]
+    assert statistics(run.training.objective.model)["train/dropped_samples"] == 0
     assert run.all_losses().unique().numel() == 6
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
-    assert sorted(size for size, _ in run.training.recorded.recordings) == [32, 48]
+    assert sorted(size for size, _ in run.training.gradients.recordings) == [32, 48]
 
 
 def test_each_of_several_processes_records_its_share(monkeypatch):
     monkeypatch.setattr(ranks, "world_size", lambda: 2)
     monkeypatch.setattr(ranks, "add_up", lambda tensors: None)  # the other one has nothing to add
     monkeypatch.setattr(ranks, "from_first", lambda make: make())
-    run = trained([48] * 3, record=True)
-    assert_same(run, trained([48] * 3, record=False))
-    assert [size for size, _ in run.training.recorded.recordings] == [24]
+    sizes = [48, 48, 47]  # of which it has 24 each time
+    run = trained(sizes, record=True)
+    assert_same(run, trained(sizes, record=False))
+    assert [(size, whole) for size, (_, whole, *_) in run.training.gradients.recordings] == [(24, 48), (24, 47)]
 
 
 IN_TWO = """
@@ -84,9 +86,9 @@ from test_recorded_gradients import CPU_BACKENDS, OccupancySampler, trained, wit
 OccupancySampler.capacity_for = lambda sampler, rays: 8192
 with without(*CPU_BACKENDS):
     runs = [trained([48, 32, 48, 48], record) for record in (True, False)]
-sizes = [size for size, _ in runs[0].training.recorded.recordings]
-replayed, taken = ((run.all_losses(), run.training.model.state_dict()) for run in runs)
-result = sizes, replayed, taken, [each.detach() for each in runs[0].training.model.parameters()]
+sizes = [size for size, _ in runs[0].training.gradients.recordings]
+replayed, taken = ((run.all_losses(), run.training.objective.model.state_dict()) for run in runs)
+result = sizes, replayed, taken, [each.detach() for each in runs[0].training.objective.model.parameters()]
 """
 
 
@@ -101,8 +103,8 @@ def test_two_processes_that_replay_their_shares_learn_what_they_learn_without_an
 def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():
     run, other = trained([48] * 3, record=True), trained([48] * 3, record=False)
     for each in (run, other):
-        each.training.restart(each.optimizer)
-        assert each is other or not each.training.recorded.recordings
+        restart(each.training, each.optimizer)
+        assert each is other or not each.training.gradients.recordings
         for _ in range(3):
             each.step()
     assert_same(run, other)
@@ -117,10 +119,10 @@ def test_what_asks_the_host_cannot_be_recorded(monkeypatch):
 def test_what_the_host_decides_is_refused_by_name():
     run = step_by_step("fast_small", CPU)
     run.training.objective.loss = RobustLoss(run.training.objective.loss)
-    encoder = next(each for each in run.training.model.modules() if isinstance(each, HashGridEncoder))
+    encoder = next(each for each in run.training.objective.model.modules() if isinstance(each, HashGridEncoder))
     encoder.blend_in = 0.5
     with pytest.raises(InputError, match=rf"{SETTING}.*another step: HashGridEncoder, RobustLoss. Leave it out"):
-        run.training.record_gradients(record=tape)
+        replay_steps(run.training)
 
 
 PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.learn_always=2")
@@ -137,13 +139,13 @@ PROPOSALS = ("model.levels.proposal.learn_every=3", "+model.levels.proposal.lear
 def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes, variants):
     run = trained([48] * 6, True, model, *changes)
     assert_same(run, trained([48] * 6, False, model, *changes))
-    assert len(run.training.recorded.recordings) == variants
+    assert len(run.training.gradients.recordings) == variants
 
 
 def test_models_that_read_on_the_host_and_other_devices_are_refused(monkeypatch):
     monkeypatch.setattr(RaggedLevel, "replays", False)
     with pytest.raises(InputError, match=rf"{SETTING}.*another step: RaggedLevel\."):
-        step_by_step("fast_small", CPU).training.record_gradients(record=tape)
+        replay_steps(step_by_step("fast_small", CPU).training)
     with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
         TrainerSettings(accelerator="cpu", cuda_graph=True)
 
@@ -179,27 +181,27 @@ def test_what_cannot_be_recorded_is_computed_without(error, cause, caplog):
         raise error
 
     run = step_by_step("fast_small", CPU, "32-true", None, *SMALL)
-    run.training.record_gradients(record=refused)
+    replay_steps(run.training, refused)
     for _ in range(3):
         run.step()
     assert [each.count(cause) for each in caplog.messages] == [1]
-    assert not run.training.recorded
+    assert not run.training.gradients.replays
     assert_same(run, trained([48] * 3, record=False))
 
 
 def test_a_recorded_step_that_is_not_finite_changes_nothing_and_is_counted(monkeypatch):
     run = trained([48] * 3, record=True)
-    before = {name: value.clone() for name, value in run.training.model.named_parameters()}
+    before = {name: value.clone() for name, value in run.training.objective.model.named_parameters()}
     batch = run.loader.at(0, 0)
     with monkeypatch.context() as patch:
         patch.setattr(run.loader, "at", lambda *place: replace(batch, rgba=torch.full_like(batch.rgba, torch.nan)))
         run.step()
     assert run.training.guard.state() == [1, 1]
-    for name, value in run.training.model.named_parameters():
+    for name, value in run.training.objective.model.named_parameters():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0, msg=name)
     run.step()
     assert run.training.guard.state() == [1, 0]
-    assert not torch.equal(run.training.model.state_dict()[name], before[name])
+    assert not torch.equal(run.training.objective.model.state_dict()[name], before[name])
 
 
 @pytest.mark.parametrize(
@@ -214,23 +216,23 @@ def test_a_recorded_step_that_is_not_finite_changes_nothing_and_is_counted(monke
 )
 def test_steps_are_recorded_where_that_is_possible(setting, device, compile, model, recorded):
     name, *changes = model.split(",")
-    step = step_by_step(name, CPU, "32-true", None, *(f"encoder.{change}=0.5" for change in changes)).training
+    train_step = step_by_step(name, CPU, "32-true", None, *(f"encoder.{change}=0.5" for change in changes)).training
     settings = TrainerSettings(accelerator="cpu", cuda_graph=setting, compile=compile)
     settings.device_type = device
-    assert settings.records(step) is recorded
-    step.objective.loss = type("Own", (type(step.objective.loss),), {"__module__": "my_parts"})()
-    assert settings.records(step) is False
+    assert settings.records(train_step) is recorded
+    train_step.objective.loss = type("Own", (type(train_step.objective.loss),), {"__module__": "my_parts"})()
+    assert settings.records(train_step) is False
 
 
 @pytest.mark.parametrize(("says", "auto"), [(True, True), (None, False), (False, False)])
 def test_a_part_of_ones_own_says_itself_whether_it_can_be_replayed(says, auto):
-    step = step_by_step("fast_small", CPU).training
+    train_step = step_by_step("fast_small", CPU).training
     own = {"__module__": "my_parts"} | ({} if says is None else {"replays": says})
-    step.objective.correction = type("Mood", (NoCorrection,), own)()
+    train_step.objective.correction = type("Mood", (NoCorrection,), own)()
     settings = TrainerSettings(accelerator="cpu")
     settings.device_type = "cuda"
-    assert settings.records(step) is auto
+    assert settings.records(train_step) is auto
     if says is not False:
-        return step.record_gradients(record=tape)
+        return replay_steps(train_step)
     with pytest.raises(InputError, match=rf"{SETTING}.*another step: Mood\. Leave it out"):
-        step.record_gradients(record=tape)
+        replay_steps(train_step)

@@ -15,7 +15,9 @@ from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.randomness import batch_random, fold
+from nerf_lightning.training.attempts import draw_weights, restart
 from nerf_lightning.training.gradients.tiles import Share
+from nerf_lightning.training.step_guard import first_not_finite
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -44,68 +46,67 @@ def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they
     seen = clipped(batch, clipped.new_optimizer(), measure_gradients=True)
     RayBatches(scene, whole.progress, 0, 64)
     assert whole(batch, whole.new_optimizer()).gradient_norms == {}
-    for name, level in whole.model.levels.items():
+    for name, level in whole.objective.model.levels.items():
         expected = torch.cat([parameter.grad.flatten() for parameter in level.parameters()]).norm()
         assert float(expected) > 1e-3
         torch.testing.assert_close(seen.gradient_norms[name], expected)
 
 
 def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
-    step, steps = make_step(None), []
-    optimizer = step.new_optimizer()
-    optimizer.step = lambda: steps.append(step.progress.step)
-    color = step.model.levels["fine"].field.color_head.weight
+    train_step, steps = make_step(None), []
+    optimizer = train_step.new_optimizer()
+    optimizer.step = lambda: steps.append(train_step.progress.step)
+    color = train_step.objective.model.levels["fine"].field.color_head.weight
     good, broken = color.detach().clone(), torch.full_like(color, float("nan"))
-    loader = RayBatches(ball_scene(), step.progress, 0, 64)
+    loader = RayBatches(ball_scene(), train_step.progress, 0, 64)
     for weights in (good, broken, broken, good):
         with torch.no_grad():
             color.copy_(weights)
-        step(loader.at(0, step.progress.rays_seen), optimizer)
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
     assert steps == [0, 3]
-    assert step.guard.skipped == 2
-    assert step.guard.state() == [2, 0]
-    assert step.progress.step == 4
+    assert train_step.guard.skipped == 2
+    assert train_step.guard.state() == [2, 0]
+    assert train_step.progress.step == 4
 
 
 def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
-    step = make_step(None)
+    train_step = make_step(None)
     with torch.no_grad():
-        step.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    gradients(step, ball_scene(), steps=7)
-    assert step.guard.in_row == 7
-    assert step.guard.first_module.startswith("levels.fine.field.")
-    assert not step.all_finite()
-    assert step.broken_weights() == "levels.fine.field.color_head"
+        train_step.objective.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
+    gradients(train_step, ball_scene(), steps=7)
+    assert train_step.guard.in_row == 7
+    assert train_step.guard.first_module.startswith("levels.fine.field.")
+    assert first_not_finite(train_step.objective.named_weights()) == "levels.fine.field.color_head"
 
 
 def test_a_run_that_starts_from_weights_restarts_from_them():
-    step = make_step(None)
-    weights = {name: torch.full_like(value, 0.25) for name, value in step.model.named_parameters()}
-    step.start_weights = step.model.state_dict() | weights
-    step.draw_weights()
-    assert all(bool((parameter == 0.25).all()) for parameter in step.model.parameters())
+    train_step = make_step(None)
+    weights = {name: torch.full_like(value, 0.25) for name, value in train_step.objective.model.named_parameters()}
+    train_step.start_weights = train_step.objective.model.state_dict() | weights
+    draw_weights(train_step)
+    assert all(bool((parameter == 0.25).all()) for parameter in train_step.objective.model.parameters())
 
 
 def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     states = []
     for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:
         torch.rand(3)  # what was drawn before must not matter
-        step = make_step(None, seed=seed)
-        step.progress.attempt = attempt
-        step.draw_weights()
-        states.append(torch.cat([p.detach().flatten() for p in step.model.parameters()]))
+        train_step = make_step(None, seed=seed)
+        train_step.progress.attempt = attempt
+        draw_weights(train_step)
+        states.append(torch.cat([p.detach().flatten() for p in train_step.objective.model.parameters()]))
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
     assert not torch.equal(states[0], states[3])
 
 
 def test_the_learning_rate_follows_the_schedule():
-    step = make_step(None)
-    step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
+    train_step = make_step(None)
+    train_step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
     rates = []
-    loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 16), step.new_optimizer()
+    loader, optimizer = RayBatches(ball_scene(), train_step.progress, 0, 16), train_step.new_optimizer()
     for _ in range(4):
-        step(loader.at(0, 0), optimizer)
+        train_step(loader.at(0, 0), optimizer)
         rates.append(optimizer.param_groups[0]["lr"])
     assert rates == [0.5, 0.5, 0.25, 0.125]
 
@@ -172,41 +173,41 @@ def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(mon
 
 
 def robust_step(tile_points, patch=4):
-    step = make_step(tile_points)
-    step.objective.loss = RobustLoss(MeanSquaredError(), patch=patch)
-    step.objective.loss.threshold.fill_(0.05)  # leaves some out
-    return step
+    train_step = make_step(tile_points)
+    train_step.objective.loss = RobustLoss(MeanSquaredError(), patch=patch)
+    train_step.objective.loss.threshold.fill_(0.05)  # leaves some out
+    return train_step
 
 
 @pytest.mark.parametrize("tile_points", [40, 300, 700])
 def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
     scene, found = ball_scene(), []
-    for step in (robust_step(None), robust_step(tile_points)):
-        loader = RayBatches(scene, step.progress, 0, 64, patch=4)
-        seen = step(loader.at(0, 0), step.new_optimizer())
-        flat = torch.cat([p.grad.flatten() for p in step.model.parameters()])
-        found.append((flat, seen.losses, step.objective.loss.threshold))
+    for train_step in (robust_step(None), robust_step(tile_points)):
+        loader = RayBatches(scene, train_step.progress, 0, 64, patch=4)
+        seen = train_step(loader.at(0, 0), train_step.new_optimizer())
+        flat = torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()])
+        found.append((flat, seen.losses, train_step.objective.loss.threshold))
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
     assert float(found[0][2]) != pytest.approx(0.05)
     plain = make_step(None)
     plain(RayBatches(scene, plain.progress, 0, 64, patch=4).at(0, 0), plain.new_optimizer())
-    assert not torch.allclose(found[0][0], torch.cat([p.grad.flatten() for p in plain.model.parameters()]))
+    assert not torch.allclose(found[0][0], torch.cat([p.grad.flatten() for p in plain.objective.model.parameters()]))
 
 
 def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_smaller_batches_hold_whole_squares():
-    step = robust_step(None)
-    loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 64, patch=4), step.new_optimizer()
+    train_step = robust_step(None)
+    loader, optimizer = RayBatches(ball_scene(), train_step.progress, 0, 64, patch=4), train_step.new_optimizer()
     with torch.no_grad():
-        step.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    step(loader.at(0, 0), optimizer)
-    assert float(step.objective.loss.threshold) == pytest.approx(0.05)
-    step.restart(optimizer)
-    assert float(step.objective.loss.threshold) == 1.0
-    step = make_step(None, sample_budget=8 * 40)
-    step.objective.loss = RobustLoss(MeanSquaredError(), patch=4)
-    loader = RayBatches(ball_scene(), step.progress, 0, 64, patch=4)
-    step(loader.at(0, 0), step.new_optimizer())
-    assert step.progress.batch_rays == 16
+        train_step.objective.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
+    train_step(loader.at(0, 0), optimizer)
+    assert float(train_step.objective.loss.threshold) == pytest.approx(0.05)
+    restart(train_step, optimizer)
+    assert float(train_step.objective.loss.threshold) == 1.0
+    train_step = make_step(None, sample_budget=8 * 40)
+    train_step.objective.loss = RobustLoss(MeanSquaredError(), patch=4)
+    loader = RayBatches(ball_scene(), train_step.progress, 0, 64, patch=4)
+    train_step(loader.at(0, 0), train_step.new_optimizer())
+    assert train_step.progress.batch_rays == 16
 
 
 def test_weights_that_are_not_finite_are_not_saved():
@@ -225,7 +226,7 @@ def test_validation_has_no_jitter():
     fits = {"state": TrainerState(fn=TrainerFn.FITTING), "loggers": [logger], "global_step": 3}
     system._trainer = type("T", (), {"sanity_checking": False} | fits)()
     system.log_dict = lambda values, **options: None
-    loader = RayBatches(ball_scene(), system.step.progress, 0, 64)
+    loader = RayBatches(ball_scene(), system.train_step.progress, 0, 64)
     values = []
     for _ in range(2):
         with torch.no_grad():
@@ -237,38 +238,38 @@ def test_validation_has_no_jitter():
 
 
 def a_step_with_shifts(tile_points=None, model=None, **settings):
-    scene, step = ball_scene(), make_step(tile_points, model)
-    step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
-    return step
+    scene, train_step = ball_scene(), make_step(tile_points, model)
+    train_step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
+    return train_step
 
 
-def batch_of(step):
-    return RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
+def batch_of(train_step):
+    return RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
 
 
 def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_model_does():
-    step = a_step_with_shifts(learning_rate=0.25)
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3, weight_decay=0.1)
-    step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1)
-    optimizer = step.new_optimizer()
+    train_step = a_step_with_shifts(learning_rate=0.25)
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3, weight_decay=0.1)
+    train_step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1)
+    optimizer = train_step.new_optimizer()
     for _ in range(3):
-        step(batch_of(step), optimizer)
+        train_step(batch_of(train_step), optimizer)
     model, own = optimizer.param_groups
-    assert own["params"] == [step.rays.shift]
-    assert not any(parameter is step.rays.shift for parameter in model["params"])
+    assert own["params"] == [train_step.objective.rays.shift]
+    assert not any(parameter is train_step.objective.rays.shift for parameter in model["params"])
     assert (own["lr"], own["weight_decay"]) == (0.25 / 4, 0.0)
     assert (model["lr"], model["weight_decay"]) == (1e-3 / 4, 0.1)
     (group,) = a_step_with_shifts().new_optimizer().param_groups
     assert any(parameter.shape == (6, 3) for parameter in group["params"])
-    step = make_step(None, tiny_model())
-    field = step.model.last.field
+    train_step = make_step(None, tiny_model())
+    field = train_step.objective.model.last.field
     field.learning_rate = 0.5
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    others, quick = step.new_optimizer().param_groups
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    others, quick = train_step.new_optimizer().param_groups
     own = {id(each) for each in field.parameters()}
     assert (quick["lr"], others["lr"]) == (0.5, 1e-3)
     assert {id(each) for each in quick["params"]} == own
-    assert len(others["params"]) + len(own) == len(list(step.model.parameters()))
+    assert len(others["params"]) + len(own) == len(list(train_step.objective.model.parameters()))
 
 
 @pytest.mark.parametrize(
@@ -277,25 +278,27 @@ def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_mo
 def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(tile_points, parts):
     model = tiny_model(density_bias=0.5).requires_grad_(False)
     light, heavy = (a_step_with_shifts(tile_points, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
-    for step in (light, heavy):
-        batch = batch_of(step)
+    for train_step in (light, heavy):
+        batch = batch_of(train_step)
         for part in parts:
-            step.gradients(batch[part], share=Share(part.start, 64, batch.weight.sum()))
-    torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
+            train_step.gradients(batch[part], train_step.key, Share(part.start, 64, batch.weight.sum()))
+    torch.testing.assert_close(
+        heavy.objective.rays.shift.grad - light.objective.rays.shift.grad, torch.full((6, 3), -10.0)
+    )
 
 
 def test_parts_that_are_not_finite_are_seen_and_a_new_attempt_begins_where_the_first_began():
-    step = a_step_with_shifts()
+    train_step = a_step_with_shifts()
     with torch.no_grad():
-        step.rays.shift.fill_(3.0)
-    step.restart(step.new_optimizer())
-    assert float(step.rays.shift.detach().abs().max()) == 0
-    step = a_step_with_shifts(weight=1.0)
+        train_step.objective.rays.shift.fill_(3.0)
+    restart(train_step, train_step.new_optimizer())
+    assert float(train_step.objective.rays.shift.detach().abs().max()) == 0
+    train_step = a_step_with_shifts(weight=1.0)
     with torch.no_grad():
-        step.rays.shift[:] = float("inf")
-    step(batch_of(step), step.new_optimizer())
-    assert step.guard.skipped == 1
-    assert step.broken_weights() == "rays"
+        train_step.objective.rays.shift[:] = float("inf")
+    train_step(batch_of(train_step), train_step.new_optimizer())
+    assert train_step.guard.skipped == 1
+    assert first_not_finite(train_step.objective.named_weights()) == "rays"
 
 
 @pytest.mark.parametrize("tile_points", [None, 60, 200])
@@ -311,13 +314,13 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
     frowning.__class__ = Frowning
     losses, gradients = [], []
     for model in (plain, frowning):
-        step = make_step(tile_points, model)
-        batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
-        seen = step.gradients(batch)
+        train_step = make_step(tile_points, model)
+        batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
+        seen = train_step.gradients(batch, train_step.key)
         losses.append(seen.losses)
         gradients.append(torch.cat([each.grad.flatten() for each in model.parameters()]))
     random = batch_random(fold(0, 0, 0), 64)
-    rays = replace(step.rays(batch.pixels), photograph=batch.pixels.view)
+    rays = replace(train_step.objective.rays(batch.pixels), photograph=batch.pixels.view)
     last = plain(rays, torch.ones(64, 3), random)[-1]
     penalty = (rays.photograph * last.depth).mean()
     torch.testing.assert_close(losses[1] - losses[0], torch.stack([torch.zeros(()), penalty.detach()]))

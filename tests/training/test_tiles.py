@@ -35,12 +35,13 @@ def threads():
 def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_points=200):
     """What a step of 64 rays leaves in the parameters' gradients, and what it has lost, on so many threads."""
     threads(count)
-    step = make_step(tile_points, copy.deepcopy(model))
-    optimizer = step.new_optimizer()
+    train_step = make_step(tile_points, copy.deepcopy(model))
+    optimizer = train_step.new_optimizer()
     optimizer.zero_grad()
-    seen = step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), backward)
-    counts = torch.cat([count.float() for count in sample_counts(step.model)] or [torch.zeros(1)])
-    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen, counts
+    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
+    seen = train_step.gradients(batch, train_step.key, backward=backward)
+    counts = torch.cat([count.float() for count in sample_counts(train_step.objective.model)] or [torch.zeros(1)])
+    return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen, counts
 
 
 def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads):

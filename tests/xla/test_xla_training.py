@@ -23,7 +23,7 @@ def test_losses_equal_the_cpus_and_the_step_is_compiled_once(name, tmp_path):
     there = train(tmp_path / "xla", name, "tpu", callbacks=[Checkpoints(every_steps=1000)])
     here = train(tmp_path / "cpu", name, "cpu")
     torch.testing.assert_close(there.losses, here.losses, rtol=1e-5, atol=0)
-    assert there.system.step.guard.skipped == 0
+    assert there.system.train_step.guard.skipped == 0
     there.counters.require_quiet_after(SETTLED[name])
     saved = torch.load(tmp_path / "xla" / "checkpoints" / "last.ckpt", weights_only=True)
     for key, value in here.system.state_dict().items():

@@ -87,25 +87,26 @@ def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
 
 def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     """Put the model on its device, in the precision and with the tile that suit it, or that the run began with."""
-    step, settings, former = job.system.step, job.settings, folder.former
+    train_step, settings, former = job.system.train_step, job.settings, folder.former
     if former is not None:
         log.info("resuming from step %d of %s", former.step, folder.path)
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
-        step.tiles.points = settings.tile_points
-    settings.prepare(step.model)
+        train_step.tiles.points = settings.tile_points
+    settings.prepare(train_step.objective.model)
     job.system.record["precision"] = settings.precision
     # A recording takes whole batches.
-    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(step)
+    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(train_step)
     if former is None and measures_tile:
-        tile, seconds = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
-        step.tiles.points = settings.tile_points = tile
+        tile, seconds = ranks.from_first(lambda: measured_tile(settings, train_step, job.data.batches))
+        train_step.tiles.points = settings.tile_points = tile
         if seconds is not None:
             _announce_hours(job, seconds)
     if ranks.is_first():
-        announce_memory(settings, step, job.data)
+        announce_memory(settings, train_step, job.data)
     if settings.compile:
-        log.info("compiled levels: %s", ", ".join(step.model.compile_fields()) or "none has static shapes")
+        compiled = train_step.objective.model.compile_fields()
+        log.info("compiled levels: %s", ", ".join(compiled) or "none has static shapes")
 
 
 def _announce_hours(job: TrainJob, seconds: float) -> None:
@@ -129,7 +130,7 @@ def _announce_hours(job: TrainJob, seconds: float) -> None:
 
 def _announce(job: TrainJob, folder: HeldFolder) -> None:
     parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
-    tile = job.system.step.tiles.points
+    tile = job.system.train_step.tiles.points
     how = "whole batches" if tile is None else f"tiles of {tile} points"
     seconds = job.config.budget.seconds
     log.info(
@@ -141,7 +142,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         job.data.batches.batch_rays,
         f"{parameters:,}",
         job.settings.describe(),
-        "steps replayed" if job.settings.records(job.system.step) else how,
+        "steps replayed" if job.settings.records(job.system.train_step) else how,
     )
     if folder.former is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")

@@ -15,7 +15,6 @@ from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address, tunnel
@@ -89,7 +88,7 @@ class LiveView(Callback):
             pl_module.model,
             scene_record(scene),
             scene.background,
-            pl_module.step.tiles.points or WHOLE_BATCH_POINTS,
+            pl_module.train_step.tiles.picture_points,
             self.share,
             MOVING_SECONDS,
         )
@@ -103,10 +102,6 @@ class LiveView(Callback):
         # Its token is for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether anybody looks on, or has asked to stop."""
-        return self.switch.wants_stop or not (self.page is None or self.page.queue.is_empty)
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
         if ranks.largest(float(self.switch.wants_stop)):
@@ -114,7 +109,7 @@ class LiveView(Callback):
             self._say(f"training was stopped from the page at step {trainer.global_step}")
         if self.page is None:
             return
-        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.step.num_steps
+        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.train_step.num_steps
         if self.switch.wants_pause:
             self._pause(trainer, pl_module, self.page)
         now = time.perf_counter()
@@ -150,7 +145,7 @@ class LiveView(Callback):
             seconds = self.switch.pause_while(
                 page.queue.work_or_wait,
                 lambda: not page.is_empty,
-                lambda: any(each.is_due(trainer, system) for each in signals),
+                lambda: any(each.asked_to_stop() for each in signals),
             )
         finally:
             renderer.share = share

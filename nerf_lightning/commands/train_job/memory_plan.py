@@ -84,11 +84,11 @@ class MemoryPlan:
         )
 
 
-def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> MemoryPlan:
+def memory_plan(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> MemoryPlan:
     """Plan by short trials: what a step and a picture hold is counted and scaled up."""
     device, tile = settings.device, settings.tile_points
     free = free_memory(device)
-    trial = try_out(settings, step, data.batches, tile)
+    trial = try_out(settings, train_step, data.batches, tile)
     pixels = data.scene.pixels
     moves = data.fits(device)
     where = "GPU" if device.type == "cuda" else "memory"
@@ -106,42 +106,44 @@ def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule)
     return MemoryPlan(
         [
             row,
-            Row("weights, tables, grids", _weights(step), f"{where}, there already", False),
+            Row("weights, tables, grids", _weights(train_step), f"{where}, there already", False),
             Row("gradients", trial.gradients, where, cure=tables),
             Row("optimizer's state", trial.optimizer, where, cure=tables),
             Row("gaps in the heap, about", gaps, where),
-            *([Row("compiled products, about", _compiled(step), where)] if compiles else []),
+            *([Row("compiled products, about", _compiled(train_step), where)] if compiles else []),
         ],
         steps,
         free,
     )
 
 
-def _weights(step: TrainStep) -> int:
-    return sum(tensor.nbytes for tensor in [*step.model.parameters(), *step.model.buffers()])
+def _weights(train_step: TrainStep) -> int:
+    model = train_step.objective.model
+    return sum(tensor.nbytes for tensor in [*model.parameters(), *model.buffers()])
 
 
-def _compiled(step: TrainStep) -> int:
-    return COMPILED_PER_MATRIX * len(matrices_of(step.model))
+def _compiled(train_step: TrainStep) -> int:
+    return COMPILED_PER_MATRIX * len(matrices_of(train_step.objective.model))
 
 
-def at_most(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> int:
+def at_most(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> int:
     """Return bytes that a run surely does not exceed, without a trial: several times what it takes."""
-    model, pixels, batch = step.model, data.scene.pixels, data.batches.progress.largest_batch
+    model, pixels, batch = train_step.objective.model, data.scene.pixels, data.batches.progress.largest_batch
     whole = batch * model.points_per_ray(training=True)
     points = whole if settings.tile_points is None else threads_on(settings.device) * settings.tile_points
     features = 4 * sum(sum(matrix.shape) for matrix in matrices_of(model))
     largest = int((pixels.width * pixels.height).max())
     picture = PIXEL_BYTES * largest + CHUNK_BYTES * min(largest, CHUNK_PIXELS)
-    held = num_bytes(pixels) + 4 * _weights(step) + _compiled(step) + batch * RAY_BYTES + picture
+    held = num_bytes(pixels) + 4 * _weights(train_step) + _compiled(train_step) + batch * RAY_BYTES + picture
     return int(held + KEPT * points * (features + POINT_BYTES))
 
 
-def announce_memory(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> None:
+def announce_memory(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> None:
     """Log one line of the plan where it is not small, its rows for who asks for details (-v), and where it is short."""
-    if not log.isEnabledFor(logging.DEBUG) and at_most(settings, step, data) < SMALL * free_memory(settings.device):
+    small = SMALL * free_memory(settings.device)
+    if not log.isEnabledFor(logging.DEBUG) and at_most(settings, train_step, data) < small:
         return
-    plan = memory_plan(settings, step, data)
+    plan = memory_plan(settings, train_step, data)
     for line in str(plan).splitlines():
         log.debug("%s", line)
     if plan.total > SMALL * plan.free:

@@ -24,6 +24,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
+from nerf_lightning.nerf.part import reset_statistics
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -51,49 +52,51 @@ class Trial:
     """Rendering the largest picture, or measuring and showing it."""
 
 
-def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> Trial:
+def try_out(settings: TrainerSettings, train_step: TrainStep, batches: RayBatches, tile: int | None) -> Trial:
     """Return what the run will hold, by trials that leave nothing behind; a `tile` of None: whole batches."""
-    step.to(settings.device)
-    trainable = [parameter for parameter in step.model.parameters() if parameter.requires_grad]
+    train_step.objective.to(settings.device)
+    trainable = [parameter for parameter in train_step.objective.model.parameters() if parameter.requires_grad]
     gradients = sum(parameter.nbytes for parameter in trainable)
     beside = threads_on(settings.device)
     # Tiles go one after the other: what other threads allocate is not seen, and is counted by their number.
-    with _untouched(step), torch_threads(1):
-        batch, activations = _step(settings, step, batches, tile, gradients, beside)
-        picture = _picture(settings, step, batches, tile, beside)
-    return Trial(gradients, _optimizer_bytes(step, trainable), batch, activations, picture)
+    with _untouched(train_step), torch_threads(1):
+        batch, activations = _step(settings, train_step, batches, tile, gradients, beside)
+        picture = _picture(settings, train_step, batches, tile, beside)
+    return Trial(gradients, _optimizer_bytes(train_step, trainable), batch, activations, picture)
 
 
 @contextmanager
-def _untouched(step: TrainStep) -> Iterator[None]:
+def _untouched(train_step: TrainStep) -> Iterator[None]:
     """Put everything back that trial steps change; no trial changes weights."""
-    buffers, former = list(step.model.buffers()), [buffer.clone() for buffer in step.model.buffers()]
-    tile = step.tiles.points
+    buffers = list(train_step.objective.model.buffers())
+    former = [buffer.clone() for buffer in buffers]
+    tile = train_step.tiles.points
     try:
         yield
     finally:
-        step.tiles.points = tile
-        step.reset_statistics()
+        train_step.tiles.points = tile
+        train_step.objective.zero_grad(set_to_none=True)
+        reset_statistics(train_step.objective)
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
 
 
 def _step(
-    settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, gradients: int, beside: int
+    settings: TrainerSettings, train_step: TrainStep, batches: RayBatches, tile: int | None, gradients: int, beside: int
 ) -> tuple[int, int]:
     """Return what grows with the batch, and what grows with the tiles, of which so many are beside each other."""
-    model, optimizer = step.model, step.new_optimizer()
+    model, optimizer = train_step.objective.model, train_step.new_optimizer()
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = batch.num_rays
 
     def held(tile_rays: int, parts: int) -> int:
         points = model.points_per_ray(training=True)
-        step.tiles.points = int((tile_rays + 0.5) * points)
+        train_step.tiles.points = int((tile_rays + 0.5) * points)
         some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
 
         def work() -> None:
             optimizer.zero_grad()
-            step.gradients(some)
+            train_step.gradients(some, train_step.key)
 
         model.zero_grad(set_to_none=True)
         return peak_bytes(work, settings.device)
@@ -117,17 +120,19 @@ def _few_rays(model: Model, training: bool) -> int:
     return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
 
 
-def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, beside: int) -> int:
+def _picture(
+    settings: TrainerSettings, train_step: TrainStep, batches: RayBatches, tile: int | None, beside: int
+) -> int:
     """Return what the largest picture of the scene holds while it is rendered, or measured and shown."""
-    model, device = step.model, settings.device
+    model, device = train_step.objective.model, settings.device
     few = _few_rays(model, training=False)
     pixels = batches.at(0, batches.crop_rays(0)).pixels.to(device)
 
     def rendered(count: int) -> int:
         some = pixels[torch.arange(count, device=device) % pixels.view.numel()]
         with torch.no_grad():
-            behind = background_colors(step.objective.background, count, device, None)
-            return peak_bytes(lambda: model(step.rays(some), behind, None), device)
+            behind = background_colors(train_step.objective.background, count, device, None)
+            return peak_bytes(lambda: model(train_step.objective.rays(some), behind, None), device)
 
     per_ray = (rendered(2 * few) - rendered(few)) / few
     num_pixels = int((batches.scene.pixels.width * batches.scene.pixels.height).max())
@@ -161,10 +166,10 @@ def _measured_and_shown(picture: Picture) -> None:
     mosaic(panels(truth, picture.rgb, 1.0 * picture.depth, picture.opacity))
 
 
-def _optimizer_bytes(step: TrainStep, trainable: list[nn.Parameter]) -> int:
+def _optimizer_bytes(train_step: TrainStep, trainable: list[nn.Parameter]) -> int:
     """Return what the optimizer will remember: as much per weight as it does of a small example."""
     example = nn.Parameter(torch.zeros(EXAMPLE, device=trainable[0].device))
-    optimizer = step.build_optimizer([{"params": [example]}])
+    optimizer = train_step.build_optimizer([{"params": [example]}])
     example.grad = torch.zeros_like(example)
     optimizer.step()
     kept = sum(value.numel() for value in optimizer.state[example].values() if isinstance(value, Tensor))

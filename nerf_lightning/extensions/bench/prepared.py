@@ -40,7 +40,7 @@ class Bench:
     """What is measured, ready to run."""
 
     settings: TrainerSettings
-    step: TrainStep
+    train_step: TrainStep
     data: RayDataModule
     optimizer: torch.optim.Optimizer
     plain_optimizer: torch.optim.Optimizer
@@ -62,20 +62,20 @@ class Bench:
 
     def train_on(self, batch: Batch) -> None:
         """Compute gradients and update; where training replays steps, by a replay, with its guard against NaN."""
-        self._update(self.optimizer, lambda: self.step.gradients(batch))
+        self._update(self.optimizer, lambda: self.train_step.gradients(batch, self.train_step.key))
 
     def train_one_by_one(self, steps: int) -> None:
         """Take steps on the one batch, whole as in a replay, whose kernels are launched one by one."""
-        self.step.tiles.points = None
+        self.train_step.tiles.points = None
         for _ in range(steps):
-            self._update(self.optimizer, lambda: self.step.tiles(self.batch, key=0))
-        self.step.tiles.points = self.settings.tile_points
+            self._update(self.optimizer, lambda: self.train_step.tiles(self.batch, key=0))
+        self.train_step.tiles.points = self.settings.tile_points
 
     def train_plainly(self, steps: int) -> None:
         """Take steps on the one batch as one would first write them."""
         with self._plainly():
             for _ in range(steps):
-                self._update(self.plain_optimizer, lambda: self.step.tiles(self.batch, key=0))
+                self._update(self.plain_optimizer, lambda: self.train_step.tiles(self.batch, key=0))
 
     def _update(self, optimizer: torch.optim.Optimizer, gradients: Callable[[], object]) -> None:
         optimizer.zero_grad()
@@ -86,14 +86,14 @@ class Bench:
         """Take one step of training, loading and all."""
         progress = self.batches.progress
         batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
-        self.step(batch, self.optimizer)
+        self.train_step(batch, self.optimizer)
 
     def render(self, num_rays: int, plain: bool = False) -> None:
         """Render rays of the one batch."""
         places = torch.arange(num_rays, device=self.settings.device) % self.batch.num_rays
-        model, background = self.step.model, self.step.objective.background
+        model, background = self.train_step.objective.model, self.train_step.objective.background
         with torch.no_grad():
-            rays = self.step.rays(self.batch.pixels[places])
+            rays = self.train_step.objective.rays(self.batch.pixels[places])
             if not plain:  # as pictures are
                 render_rays(model, rays, background, self.settings.inference_tile_points)
                 return
@@ -102,10 +102,10 @@ class Bench:
 
     @contextmanager
     def _plainly(self) -> Iterator[None]:
-        model = self.step.model
+        model = self.train_step.objective.model
         samplers = [level.sampler for level in model.modules() if isinstance(level, RaggedLevel)]
         former = [sampler.opaque_below for sampler in samplers]
-        self.step.tiles.points = None
+        self.train_step.tiles.points = None
         set_precision(model, "float32")
         for sampler in samplers:
             sampler.opaque_below = 0.0
@@ -113,13 +113,13 @@ class Bench:
         with without(*TWINS):
             yield
         self.settings.prepare(model)
-        self.step.tiles.points = self.settings.tile_points
+        self.train_step.tiles.points = self.settings.tile_points
         for sampler, value in zip(samplers, former, strict=True):
             sampler.opaque_below = value
         self._release_gradients()
 
     def _release_gradients(self) -> None:
-        for parameter in self.step.model.parameters():
+        for parameter in self.train_step.objective.model.parameters():
             parameter.grad = None
             parameter.grad_in_place = False  # type: ignore[attr-defined]
 
@@ -129,13 +129,14 @@ def prepare(config: DictConfig, scene: Scene) -> Bench:
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     progress = Progress()
-    step = build_step(config, settings, scene, progress).to(settings.device)
-    step.num_steps = max(1, config.warmup_steps)
-    settings.prepare(step.model)
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.objective.loss.patch)
+    train_step = build_step(config, settings, scene, progress)
+    train_step.objective.to(settings.device)
+    train_step.num_steps = max(1, config.warmup_steps)
+    settings.prepare(train_step.objective.model)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=train_step.objective.loss.patch)
     data.settle(settings.device)
-    step.begin_recording()
-    if step.recorded is None and settings.measures_tile:
-        settings.tile_points = step.tiles.points = measured_tile(settings, step, data.batches)[0]
-    optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
-    return Bench(settings, step, data, optimizer, plain)
+    train_step.begin_recording()
+    if not train_step.gradients.replays and settings.measures_tile:
+        settings.tile_points = train_step.tiles.points = measured_tile(settings, train_step, data.batches)[0]
+    optimizer, plain = train_step.new_optimizer(), torch.optim.Adam(train_step.objective.model.parameters(), lr=1e-6)
+    return Bench(settings, train_step, data, optimizer, plain)

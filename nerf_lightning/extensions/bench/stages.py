@@ -15,20 +15,20 @@ from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
 
-def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+def stage_seconds(train_step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
     """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing.
 
     Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest. Neither has a
     step that is replayed.
     """
-    level = next((part for part in step.model.modules() if isinstance(part, RaggedLevel)), None)
-    if level is None or step.recorded:
+    level = next((part for part in train_step.objective.model.modules() if isinstance(part, RaggedLevel)), None)
+    if level is None or train_step.gradients.replays:
         return {}
-    rays, sampler = step.rays(batch.pixels), level.sampler
+    rays, sampler = train_step.objective.rays(batch.pixels), level.sampler
     optimizer.zero_grad()
-    whole = seconds_of(lambda: step.gradients(batch))
+    whole = seconds_of(lambda: train_step.gradients(batch, train_step.key))
     update = seconds_of(optimizer.step)
-    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=step.rays.learns_cameras):
+    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=train_step.objective.rays.learns_cameras):
         return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
         points = ragged_points(rays, sampler(rays, None), None)
@@ -77,13 +77,13 @@ def multiplication(settings: TrainerSettings) -> Callable[[], None]:
     return multiply
 
 
-def flops_per_ray(step: TrainStep, batch: Batch) -> float:
+def flops_per_ray(train_step: TrainStep, batch: Batch) -> float:
     """Count the operations that training takes per ray, forward and backward, in matrix products."""
     # Where rays differ in their samples, many make the mean.
-    few = 8 if step.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
+    few = 8 if train_step.objective.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
     # It sees torch's own operations, of its own thread.
     kernels = "mlp.cpu", "mlp.cuda", "render.gradients", "render.dense"
     with torch_threads(1), FlopCounterMode(display=False) as counter, without(*kernels):
-        step.tiles(rays, key=0)
+        train_step.tiles(rays, key=0)
     return counter.get_total_flops() / few

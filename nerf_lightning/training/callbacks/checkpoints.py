@@ -13,6 +13,8 @@ from nerf_lightning.checkpoints.reading import BEST, LAST
 from nerf_lightning.files.atomic import remove_leftovers
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.step_guard import first_not_finite
 
 
 class Checkpoints(Callback):
@@ -43,10 +45,6 @@ class Checkpoints(Callback):
         if self.folder(trainer).is_dir():  # a run that ends without a further step would leave them
             remove_leftovers(self.folder(trainer))
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it is time for a checkpoint."""
-        return trainer.global_step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Write `last.ckpt` when it is time.
 
@@ -54,7 +52,7 @@ class Checkpoints(Callback):
             InputError: an earlier one could not be written.
         """
         writer(trainer, self).raise_failure()
-        if self.is_due(trainer, pl_module) and pl_module.step.all_finite():
+        if trainer.global_step % self.every_steps == 0 and _is_finite(pl_module.train_step):
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
@@ -62,7 +60,7 @@ class Checkpoints(Callback):
         value = trainer.callback_metrics.get(self.monitor)
         if trainer.sanity_checking or value is None:
             return
-        if (self.best is None or float(value) > self.best) and pl_module.step.all_finite():
+        if (self.best is None or float(value) > self.best) and _is_finite(pl_module.train_step):
             self.best = float(value)
             trainer.save_checkpoint(self.folder(trainer) / BEST)
 
@@ -108,3 +106,8 @@ def writer(trainer: Trainer, callback: Callback) -> AtomicCheckpointIO:
             f"{type(callback).__name__} out, and let Lightning's ModelCheckpoint write."
         )
     return plugin
+
+
+def _is_finite(train_step: TrainStep) -> bool:
+    """Return whether the run is one to come back to: its last step was taken, and its weights are finite."""
+    return train_step.guard.in_row == 0 and not first_not_finite(train_step.objective.named_weights())

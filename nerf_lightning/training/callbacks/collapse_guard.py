@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.objective import StepOutput
+from nerf_lightning.training.attempts import restart
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 
 log = logging.getLogger(__name__)
@@ -50,26 +51,22 @@ class CollapseGuard(Callback):
         self.ratio, self.max_restarts = ratio, max_restarts
         self.failed = 0
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it may be time to look."""
-        return pl_module.step.progress.step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then, and log a restart."""
         batches, optimizer = trainer.datamodule.batches, pl_module.optimizers().optimizer  # type: ignore[attr-defined]
-        message = self.look(pl_module.step, batches, optimizer, outputs["step"], trainer.global_step)
+        message = self.look(pl_module.train_step, batches, optimizer, outputs["step"], trainer.global_step)
         if message is None:
             return
         for logger in trainer.loggers:
-            logger.log_metrics({"train/attempt": pl_module.step.progress.attempt}, trainer.global_step)
+            logger.log_metrics({"train/attempt": pl_module.train_step.progress.attempt}, trainer.global_step)
         for writer in tensorboard_writers(trainer.loggers):
             writer.add_text("collapse_guard", message, trainer.global_step)
 
-    def look(self, step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
+    def look(self, train_step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
         """Look, where it is time, and restart a run that has collapsed.
 
         Args:
-            step: of the run, after it was taken.
+            train_step: of the run, after a step of it.
             batches: of the run.
             optimizer: of the run.
             output: what the step saw.
@@ -78,7 +75,7 @@ class CollapseGuard(Callback):
         Returns:
             What was done; None: nothing.
         """
-        progress = step.progress
+        progress = train_step.progress
         after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
             return None
@@ -95,7 +92,7 @@ class CollapseGuard(Callback):
                 progress.restarts,
             )
             return None
-        step.restart(optimizer)
+        restart(train_step, optimizer)
         message = (
             f"Step {num_steps}: the renders are constant while the photographs are not (a collapsed run). "
             f"Restarted with new weights: attempt {progress.restarts + 1} of at most {self.max_restarts + 1}."

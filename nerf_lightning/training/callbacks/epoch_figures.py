@@ -37,7 +37,7 @@ class EpochFigures(Callback):
             self.losses.append(float(outputs["step"].losses.cpu().sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
         per_figure = self.every_epochs * batches.whole.num_rays
-        progress = pl_module.step.progress
+        progress = pl_module.train_step.progress
         seen = progress.rays_seen - batches.crop_rays(progress.restarts)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
             self._draw(trainer, pl_module, epoch=seen // batches.whole.num_rays)

@@ -10,11 +10,7 @@ from nerf_lightning.files.made_folders import require_run
 
 
 class FolderGuard(Callback):
-    """Look after each step or row of steps whether the run folder is still there, before anything is written."""
-
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Never: it ends no row of steps (`StepsInARow`)."""
-        return False
+    """Look after each step whether the run folder is still there, before anything is written."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Stop where it is not.

@@ -38,7 +38,7 @@ class Monitor(Watcher):
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Start the clock."""
         self.since = time.perf_counter()
-        self.rays_seen = pl_module.step.progress.rays_seen
+        self.rays_seen = pl_module.train_step.progress.rays_seen
 
     def leave_out(self, seconds: float) -> None:
         """Do not count the last so many seconds: the training paused."""
@@ -53,7 +53,7 @@ class Monitor(Watcher):
 
     def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Log a row."""
-        progress = system.step.progress
+        progress = system.train_step.progress
         now, step = time.perf_counter(), trainer.global_step
         rays, seconds = progress.rays_seen - self.rays_seen, now - self.since
         self.since, self.rays_seen = now, progress.rays_seen
@@ -69,7 +69,7 @@ class Monitor(Watcher):
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
         values["speed/rays_per_step"] = output.weight.numel()
-        values["train/skipped_steps"] = system.step.guard.skipped
+        values["train/skipped_steps"] = system.train_step.guard.skipped
         values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
         if system.device.type == "cuda":
             values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE

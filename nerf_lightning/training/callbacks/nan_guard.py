@@ -11,9 +11,11 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning.checkpoints.reading import last_good_checkpoint
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError, require_positive
+from nerf_lightning.training.attempts import count_rollback, restart
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints, writer
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.step_guard import first_not_finite
 
 CURE = (
     "a smaller optimizer.lr, gradient clipping (trainer.clip_norm=1) or trainer.precision=32-true, and check the "
@@ -62,34 +64,30 @@ class NanGuard(Callback):
         """
         writer(trainer, self)
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether it is time to look at the weights."""
-        return pl_module.step.progress.step % self.every_steps == 0
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look whether the run still learns.
 
         Raises:
             InputError: it does not, and is not to be rolled back, or was too often.
         """
-        if cause := self.cause(pl_module.step):
+        if cause := self.cause(pl_module.train_step):
             self._act(trainer, pl_module, cause)
 
-    def cause(self, step: TrainStep) -> str | None:
+    def cause(self, train_step: TrainStep) -> str | None:
         """Say why a run learns nothing any more, after a step of it; None: it does, or it was not the time to look."""
-        guard, number = step.guard, step.progress.step
+        guard, number = train_step.guard, train_step.progress.step
         looks = number % self.every_steps == 0
-        if (looks or step.device.type == "cpu") and guard.in_row >= self.patience:
+        if (looks or train_step.device.type == "cpu") and guard.in_row >= self.patience:
             return (
                 f"The loss or its gradients are not finite numbers since step {number - guard.in_row + 1} "
                 f"({guard.in_row} steps in a row, all left out; first in the gradient of {guard.first_module})"
             )
-        if looks and (broken := step.broken_weights()):
+        if looks and (broken := first_not_finite(train_step.objective.named_weights())):
             return f"The weights of step {number} are not finite numbers (first those of {broken})"
         return None
 
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
-        good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.step.progress
+        good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.train_step.progress
         if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
             raise InputError(f"{cause}, so the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
@@ -106,18 +104,18 @@ class NanGuard(Callback):
             board.add_text("nan_guard", message, trainer.global_step)
 
     def _roll_back(self, trainer: Trainer, system: Any, good: Path | None) -> None:
-        step = system.step
-        former, skipped = replace(step.progress), step.guard.skipped
+        train_step = system.train_step
+        former, skipped = replace(train_step.progress), train_step.guard.skipped
         lowered = former.rollbacks
         if good is None:
-            step.restart(system.optimizers().optimizer)
+            restart(train_step, system.optimizers().optimizer)
         else:
             content = trainer.strategy.load_checkpoint(good, weights_only=True)
             system.on_load_checkpoint(content)
             trainer.strategy.load_model_state_dict(content)
             trainer.strategy.load_optimizer_state_dict(content)
             lowered = content["nerf_lightning"]["progress"]["rollbacks"]
-        step.count_rollback(former, skipped)
+        count_rollback(train_step, former, skipped)
         for group in system.optimizers().param_groups:
             # The rate in the checkpoint may be that of before an earlier rollback.
             group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (former.rollbacks + 1 - lowered)

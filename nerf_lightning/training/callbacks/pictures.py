@@ -61,12 +61,8 @@ class ValidationPictures(Watcher):
 class CameraLayout(Callback):
     """Draw where the cameras stand once, after the first step, so that the drawing does not delay the start."""
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether this was the first step of the run."""
-        return trainer.global_step == 1
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Draw, if this was the first step of the run."""
-        if self.is_due(trainer, pl_module) and trainer.loggers:
+        if trainer.global_step == 1 and trainer.loggers:
             scene = shown_capture(trainer.datamodule.scene)  # type: ignore[attr-defined]
             show_picture(trainer.loggers, "scene/cameras", layout_picture(scene), 0)

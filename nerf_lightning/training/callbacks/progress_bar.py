@@ -60,22 +60,18 @@ class TrainingProgress(ProgressBar):
         self.task = self.bar.add_task("", total=None, step=f"{trainer.global_step:,}", left="")
         self.bar.start()
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Never: it ends no row of steps (`StepsInARow`)."""
-        return False
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
         if self.started is None:  # the first step compiles kernels, and says nothing of the others
             self.started = self.shown = now
-            self.first_step, self.rays_seen = step, pl_module.step.progress.rays_seen
+            self.first_step, self.rays_seen = step, pl_module.train_step.progress.rays_seen
             return
         if self.silent or now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
         # Negative after a restart, which counts anew.
-        rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
-        self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
+        rays_per_second = max(0.0, (pl_module.train_step.progress.rays_seen - self.rays_seen) / (now - self.shown))
+        self.shown, self.rays_seen = now, pl_module.train_step.progress.rays_seen
         output: StepOutput = outputs["step"]
         loss, quality = torch.stack([output.losses.sum(), psnr(output.color_errors[-1])]).tolist()
         text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
@@ -115,7 +111,7 @@ class TrainingProgress(ProgressBar):
 
 def _total(trainer: Trainer, pl_module: Any) -> int | None:
     """Return the length of the run in steps; with a time budget an estimate, None where there is none yet."""
-    total = pl_module.step.num_steps
+    total = pl_module.train_step.num_steps
     if total >= MOST_STEPS:
         return None
     return total if total >= trainer.estimated_stepping_batches else max(total, trainer.global_step + 1)

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.watcher import Watcher, tensorboard_writers
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.tensorboard import ALONG_RAYS, PER_RAY
 
 PARTS = 50
@@ -41,7 +41,7 @@ class RayHistograms(Watcher):
         if not writers:
             return
         step, contracted_spacing = trainer.global_step, trainer.datamodule.scene.space == "contracted"
-        seen = look_along(system.step, outputs["step"].pixels[: self.num_rays], step, contracted_spacing)
+        seen = look_along(system.train_step, outputs["step"].pixels[: self.num_rays], step, contracted_spacing)
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:
@@ -53,16 +53,16 @@ class RayHistograms(Watcher):
 
 @torch.no_grad()
 def look_along(
-    training: TrainStep, pixels: PixelIndex, step: int, contracted_spacing: bool
+    train_step: TrainStep, pixels: PixelIndex, step: int, contracted_spacing: bool
 ) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
     """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
-    model, rays = training.model, training.rays(pixels)
+    objective, tile_points = train_step.objective, train_step.tiles.picture_points
+    model, rays = objective.model, objective.rays(pixels)
     names, num_rays = model.level_names, rays.near.numel()
-    key = fold(training.seed, step, "histograms")
-    tile_points = training.tiles.points or WHOLE_BATCH_POINTS
+    key = fold(train_step.seed, step, "histograms")
     seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in names}
     model.eval()
-    for part, renderings in weighted_renderings(model, rays, training.objective.background, key, tile_points):
+    for part, renderings in weighted_renderings(model, rays, objective.background, key, tile_points):
         for name, rendering in zip(names, renderings, strict=True):
             along = weight_along(rendering, part, PARTS, contracted_spacing) * part.near.numel() / num_rays
             seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))

@@ -36,21 +36,24 @@ class StopSignals(Callback):
         self._listen()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Listen; Lightning puts a handler of its own in place shortly before, and what it heard is ours."""
-        self._listen()
-        if trainer.received_sigterm:
-            trainer._signal_connector.received_sigterm = False
-            self.heard, self.received = True, signal.SIGTERM
+        """Listen; Lightning puts a handler of its own in place shortly before.
 
-    def is_due(self, trainer: Any, pl_module: Any) -> bool:
-        """Tell whether to stop."""
+        Raises:
+            SystemExit: that one has heard a signal. No step was taken, so there is nothing to save (`preemption`).
+        """
+        if ranks.largest(float(trainer.received_sigterm)):
+            raise SystemExit(128 + signal.SIGTERM)
+        self._listen()
+
+    def asked_to_stop(self) -> bool:
+        """Return whether a signal or the file asks for a stop."""
         if self.received is None and self.stop_file is not None and self.stop_file.exists():
             self.received = signal.SIGTERM
         return self.received is not None
 
     def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Stop where the step is whole, all processes at the same one."""
-        self.is_due(trainer, pl_module)
+        self.asked_to_stop()
         received = int(ranks.largest(float(self.received or 0)))
         if received:
             self.received = received

@@ -51,24 +51,19 @@ class TimeBudget(Callback):
         if hasattr(signal, "SIGCONT"):
             self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
-            self._fit_schedule(trainer, pl_module.step)
+            self._fit_schedule(trainer, pl_module.train_step)
         else:
-            self.first = pl_module.step.progress.step
-
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether to estimate the length of the run, or to stop; the first step compiles, and is not counted."""
-        is_over = self.used + time.perf_counter() - self.since >= self.seconds
-        return self.compiles or is_over or pl_module.step.progress.step % self.every_steps == 0
+            self.first = pl_module.train_step.progress.step
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Estimate the length of the run, and stop when the time is over."""
+        """Estimate the length of the run, and stop when time is over; the first step compiles, and is not counted."""
         now = time.perf_counter()
         if not self.compiles:
             # All processes stop at the same step: the slowest clock is everybody's.
             self.used = ranks.largest(self.used + now - self.since)
         self.compiles, self.since = False, now
-        if self.used and pl_module.step.progress.step % self.every_steps == 0:
-            self._fit_schedule(trainer, pl_module.step)
+        if self.used and pl_module.train_step.progress.step % self.every_steps == 0:
+            self._fit_schedule(trainer, pl_module.train_step)
         if self.used >= self.seconds:
             trainer.should_stop = True
 
@@ -95,7 +90,7 @@ class TimeBudget(Callback):
         # When the stop began is not known: what was done of the step is left out with it.
         self.since = time.perf_counter()
 
-    def _fit_schedule(self, trainer: Trainer, training: Any) -> None:
-        step = training.progress.step
+    def _fit_schedule(self, trainer: Trainer, train_step: Any) -> None:
+        step = train_step.progress.step
         expected = self.first + int((step - self.first) * self.seconds / self.used)
-        training.num_steps = min(int(trainer.estimated_stepping_batches), max(step + 1, expected))
+        train_step.num_steps = min(int(trainer.estimated_stepping_batches), max(step + 1, expected))

@@ -17,10 +17,6 @@ class TrainingTime(Callback):
         """Start the clock."""
         self.since = time.monotonic()
 
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Never: it ends no row of steps (`StepsInARow`)."""
-        return False
-
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Count the step."""
         now = time.monotonic()

@@ -14,7 +14,6 @@ from torch.utils.tensorboard import SummaryWriter
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.visualization.pictures import LONGEST_PANEL
 
 
@@ -33,12 +32,8 @@ class Watcher(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Look when it is time."""
-        if self.is_due(trainer, pl_module):
+        if self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches)):
             self.watch(trainer, pl_module, outputs)
-
-    def is_due(self, trainer: Trainer, pl_module: Any) -> bool:
-        """Tell whether to look after the step that was taken."""
-        return self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches))
 
     def is_time(self, step: int, last_step: int) -> bool:
         """Tell whether to look after a step."""
@@ -95,7 +90,7 @@ def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int,
     scene = trainer.datamodule.scene
     views = scene.splits["val"] or scene.splits["train"]
     view = views[number % len(views)]
-    tile_points = system.step.tiles.points or WHOLE_BATCH_POINTS
+    tile_points = system.train_step.tiles.picture_points
     system.eval()
     rays = system.rays.at_most(LONGEST_PANEL)
     picture = render_picture(system.model, rays, view, scene.background, tile_points)

@@ -8,25 +8,28 @@ of a batch) would stay as it was. So all that changes from step to step comes in
 a model decides on the host between two steps has recordings of its own (`Part.step_variant`).
 """
 
+import logging
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.models.tiles import is_out_of_memory
 from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.part import parts_of, sample_counts
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.gradients.tiles import Share, TileGradients
+from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard
 
 KNOWN = (__name__.partition(".")[0], "torch")
 """Packages of whose modules it is known whether a recorded step follows them."""
 # The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
 WARM_UPS = 3
+
+log = logging.getLogger(__name__)
 
 Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOutput]]
 """Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
@@ -59,50 +62,69 @@ class _Recording:
 
 
 class RecordedGradients:
-    """Compute the gradients of batches, whole, by replaying the first of their size and the parts' variants.
+    """Compute the gradients of batches, whole, by replaying the first of their size, share and parts' variants.
 
     Args:
         tiles: computes them.
         guard: sets those of a step to zero that are not finite, where one process has all of them.
-        share_of: returns this process's part of a batch, given the sum of the weights of all of it.
         record: makes a recording.
 
     Raises:
         InputError: something here decides on the host what a step computes.
     """
 
-    def __init__(
-        self, tiles: TileGradients, guard: StepGuard, share_of: Callable[[Tensor], Share], record: Recorder = cuda_graph
-    ):
+    guards: bool
+    """Whether gradients that are not finite are zeros already."""
+    replays = True
+    """Whether batches are replayed: until a recording is refused."""
+
+    def __init__(self, tiles: TileGradients, guard: StepGuard, record: Recorder = cuda_graph):
         if kinds := not_replayed(tiles.objective):
             raise InputError(
                 "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
                 f"step: {', '.join(kinds)}. Leave it out."
             )
-        self.tiles, self.guard, self.share_of, self.record = tiles, guard, share_of, record
+        self.tiles, self.guard, self.record = tiles, guard, record
         self.parts, self.parameters = list(parts_of(tiles.objective)), list(tiles.objective.parameters())
         self.guards = ranks.world_size() == 1  # else the gradients of all are added up first
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
-    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: int) -> StepOutput:
+    def __call__(
+        self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
+    ) -> StepOutput:
         """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones.
 
-        Both are written over by the next call.
+        Both are written over by the next call. Where batches cannot be recorded, do as `TileGradients` does, which has
+        the same arguments.
         """
-        kind = batch.num_rays, tuple(part.step_variant for part in self.parts)
+        if self.replays:
+            try:
+                return self._replayed(batch, key, Share.whole(batch) if share is None else share)
+            except RuntimeError as error:
+                if not is_out_of_memory(error) and "captur" not in str(error):
+                    raise
+                cause = "there is no memory" if is_out_of_memory(error) else f"CUDA refuses: {error}".splitlines()[0]
+            log.warning("Steps are not recorded: %s. The kernels of each step are launched one by one.", cause)
+            self.guards = self.replays = False
+            self.recordings.clear()
+            self.tiles.objective.zero_grad(set_to_none=False)
+        return self.tiles(batch, key, share, backward)
+
+    def _replayed(self, batch: Batch, key: int, share: Share) -> StepOutput:
+        kind = batch.num_rays, (share.first, share.num_rays, *(part.step_variant for part in self.parts))
         if kind not in self.recordings:
-            self.recordings[kind] = self._recorded(batch, weight, key)
+            self.recordings[kind] = self._recorded(batch, key, share)
         kept = self.recordings[kind]
-        _copy([*kept.batch.tensors(), kept.weight], [*batch.tensors(), weight])
+        _copy([*kept.batch.tensors(), kept.weight], [*batch.tensors(), share.weight])
         kept.key.fill_(key)
         kept.replay()
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
         return kept.seen
 
-    def _recorded(self, batch: Batch, weight: Tensor, key: int) -> _Recording:
-        batch, weight = batch.map(Tensor.clone), weight.clone()
-        kept_key = torch.full((), key, device=weight.device)
+    def _recorded(self, batch: Batch, key: int, share: Share) -> _Recording:
+        batch, weight = batch.map(Tensor.clone), share.weight.clone()
+        kept_key, share = torch.full((), key, device=weight.device), replace(share, weight=weight)
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -114,7 +136,7 @@ class RecordedGradients:
                 # Others begin with zeros: the optimizer leaves them so (`optimizers.table_adam`).
                 if parameter.grad is not None and not getattr(parameter, "grad_in_place", False):
                     parameter.grad.zero_()
-            seen = self.tiles.in_tiles_of(batch.num_rays, batch, self.share_of(weight), kept_key)
+            seen = self.tiles.in_tiles_of(batch.num_rays, batch, share, kept_key)
             if self.guards:
                 self.guard.keep_finite(seen.losses, self.tiles.objective.named_weights())
             return seen

@@ -26,6 +26,9 @@ from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.types.rays import Batch
 
+# Points of a tile where pictures are rendered beside steps that are not cut into tiles.
+WHOLE_BATCH_POINTS = 65_536
+
 log = logging.getLogger(__name__)
 
 Backward = Callable[[Tensor], None]
@@ -43,6 +46,11 @@ class Share:
     weight: Tensor
     """Sum of the weights of the whole batch."""
 
+    @classmethod
+    def whole(cls, batch: Batch) -> "Share":
+        """Return all of a batch."""
+        return cls(0, batch.num_rays, batch.weight.sum())
+
 
 def torch_backward(loss: Tensor) -> None:
     """Add a loss's gradients to the parameters'."""
@@ -57,6 +65,8 @@ class TileGradients:
         points: most points that a tile may send through a field at once; None: the whole batch is a tile.
         jitter: False: no random numbers.
     """
+
+    guards = replays = False  # see `RecordedGradients`
 
     def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
         self.objective, self.points, self.jitter = objective, points, jitter
@@ -78,7 +88,7 @@ class TileGradients:
         Raises:
             InputError: there is no memory for the smallest tiles.
         """
-        share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
+        share = Share.whole(batch) if share is None else share
         with self.on_threads(batch.weight.device):
             while True:
                 counts = [count.clone() for count in sample_counts(self.objective)]
@@ -117,6 +127,11 @@ class TileGradients:
         for penalty in objective.penalties():
             backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
         return StepOutput.joined(seen)
+
+    @property
+    def picture_points(self) -> int:
+        """Most points that a tile of a picture, rendered beside the steps, may send through a field at once."""
+        return self.points or WHOLE_BATCH_POINTS
 
     def on_threads(self, device: torch.device) -> AbstractContextManager[None]:
         """Return a context for steps: whole batches are for torch's threads, tiles are shared out here."""

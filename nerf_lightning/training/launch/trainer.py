@@ -100,7 +100,7 @@ class TrainerSettings(ComputeSettings):
         self.compile, self.deterministic = compile, deterministic
         self.launched_by = launched_by  # read before the processes are (launch/processes.py)
 
-    def records(self, step: TrainStep) -> bool:
+    def records(self, train_step: TrainStep) -> bool:
         """Tell whether to record a run's steps.
 
         auto: not compiled ones, or those of parts of one's own that do not say whether they can be replayed.
@@ -108,11 +108,11 @@ class TrainerSettings(ComputeSettings):
         if self.cuda_graph != "auto":
             return self.cuda_graph
         tried = self.device_type == "cuda" and not self.compile
-        return tried and not not_replayed(step.objective, only_known=True)
+        return tried and not not_replayed(train_step.objective, only_known=True)
 
-    def records_there(self, step: TrainStep) -> bool:
+    def records_there(self, train_step: TrainStep) -> bool:
         """Tell whether to record a run's steps where its weights are: one's own Trainer may have moved them."""
-        return step.device.type == self.device_type and self.records(step)
+        return train_step.device.type == self.device_type and self.records(train_step)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""

@@ -55,15 +55,15 @@ def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(t
 
 
 def test_the_loss_is_the_mean_over_unmasked_pixels():
-    step, scene = make_step(None), masked(ball_scene(), lambda number: number % 3 > 0)
+    train_step, scene = make_step(None), masked(ball_scene(), lambda number: number % 3 > 0)
     batch = RayBatches(scene, Progress(), 0, 64).at(0, 0)
     kept = batch.weight > 0
     assert 0 < int(kept.sum()) < 64
-    seen = step.gradients(batch)
-    step.objective.loss.forward = lambda renderings, target: {
+    seen = train_step.gradients(batch, train_step.key)
+    train_step.objective.loss.forward = lambda renderings, target: {
         "kept": torch.stack([(each.rgb - target.rgb).square()[kept].mean() for each in renderings])
     }
-    torch.testing.assert_close(seen.losses, step.gradients(batch).losses)
+    torch.testing.assert_close(seen.losses, train_step.gradients(batch, train_step.key).losses)
 
 
 @pytest.mark.parametrize("tile_points", [16, 100])
@@ -98,10 +98,10 @@ def test_gathering_gives_masked_pixels_no_weight():
 
 
 def validation_psnr(scene):
-    step, errors = make_step(None), RayErrors()
+    train_step, errors = make_step(None), RayErrors()
     with torch.no_grad():
         for batch in FixedRays(scene, "val", 200, 64):
-            errors.of(step.objective, batch, None)
+            errors.of(train_step.objective, batch, None)
     return errors.summary()["val/psnr"]
 
 

@@ -14,6 +14,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.training.attempts import restart
 
 LEARNT = sorted(set(options("correction")) - {"none", "auto"})
 
@@ -25,9 +26,9 @@ def correction_of(option, scene):
 
 
 def a_step(option, scene, background="white", tile_points=None):
-    step = make_step(tile_points, copy.deepcopy(tiny_model(density_bias=0.5)), background)
-    step.objective.correction = correction_of(option, scene)
-    return step
+    train_step = make_step(tile_points, copy.deepcopy(tiny_model(density_bias=0.5)), background)
+    train_step.objective.correction = correction_of(option, scene)
+    return train_step
 
 
 @pytest.mark.parametrize("option", options("correction"))
@@ -35,10 +36,10 @@ def a_step(option, scene, background="white", tile_points=None):
 def test_as_it_begins_it_changes_no_bit_of_a_step(option, background):
     scene, found = ball_scene(), []
     for name in ("none", option):
-        step = a_step(name, scene, background, tile_points=200)
-        batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
-        losses = step(batch, step.new_optimizer()).losses
-        found.append([losses, *(parameter.grad for parameter in step.model.parameters())])
+        train_step = a_step(name, scene, background, tile_points=200)
+        batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
+        losses = train_step(batch, train_step.new_optimizer()).losses
+        found.append([losses, *(parameter.grad for parameter in train_step.objective.model.parameters())])
     for ours, theirs in zip(*found, strict=True):
         assert torch.equal(ours, theirs)
 
@@ -46,18 +47,18 @@ def test_as_it_begins_it_changes_no_bit_of_a_step(option, background):
 @pytest.mark.parametrize("option", LEARNT)
 def test_it_learns_from_the_photographs_that_train_and_only_of_them(option):
     scene = ball_scene(num_views=8)
-    step = a_step(option, scene)
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    optimizer, loader = step.new_optimizer(), RayBatches(scene, step.progress, 0, 64)
+    train_step = a_step(option, scene)
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    optimizer, loader = train_step.new_optimizer(), RayBatches(scene, train_step.progress, 0, 64)
     for _ in range(3):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-    for parameter in step.objective.correction.parameters():
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+    for parameter in train_step.objective.correction.parameters():
         assert float(parameter.detach().abs().max()) > 0
         if len(parameter) == 8:
             trained = torch.zeros(8, dtype=torch.bool).index_fill(0, torch.tensor(scene.splits["train"]), True)
             assert float(parameter.detach()[~trained].abs().sum()) == 0
-    step.restart(optimizer)
-    assert all(float(parameter.detach().abs().max()) == 0 for parameter in step.objective.correction.parameters())
+    restart(train_step, optimizer)
+    assert all(float(parameter.detach().abs().max()) == 0 for parameter in train_step.objective.correction.parameters())
 
 
 @pytest.mark.parametrize("option", LEARNT)
@@ -84,12 +85,12 @@ def test_the_background_looks_the_same_to_all(option, background):
     """No camera saw it: where nothing is, a correction changes neither what is shown nor what is asked for."""
     scene = ball_scene()
     scene = replace(scene, pixels=replace(scene.pixels, rgba=torch.zeros_like(scene.pixels.rgba)))
-    step = make_step(None, tiny_model(density_bias=-30.0), background)
-    step.objective.correction = correction_of(option, scene)
+    train_step = make_step(None, tiny_model(density_bias=-30.0), background)
+    train_step.objective.correction = correction_of(option, scene)
     with torch.no_grad():
-        for parameter in step.objective.correction.parameters():
+        for parameter in train_step.objective.correction.parameters():
             parameter.uniform_(-1, 1)
-    seen = step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
+    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 64).at(0, 0), train_step.key)
     torch.testing.assert_close(seen.rgb, seen.target)
     behind = seen.target
     assert background == "random" or torch.equal(behind, torch.full_like(behind, float(background == "white")))
@@ -100,17 +101,19 @@ def test_pictures_and_validation_show_the_neutral_colours(option):
     from nerf_lightning.training.validation import RayErrors
 
     scene = ball_scene()
-    step, errors = a_step(option, scene), []
-    batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
+    train_step, errors = a_step(option, scene), []
+    batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
     pictures = []
     for spread in (0.0, 2.0):
         with torch.no_grad():
-            for parameter in step.objective.correction.parameters():
+            for parameter in train_step.objective.correction.parameters():
                 parameter.uniform_(-spread, spread)
             seen = RayErrors()
-            seen.of(step.objective, batch, None)
+            seen.of(train_step.objective, batch, None)
         errors.append(torch.cat(seen.parts))
-        pictures.append(render_picture(step.model.eval(), step.rays, 0, "white", 4096).rgb)
+        pictures.append(
+            render_picture(train_step.objective.model.eval(), train_step.objective.rays, 0, "white", 4096).rgb
+        )
     assert torch.equal(*pictures)
     assert torch.equal(*errors)
 

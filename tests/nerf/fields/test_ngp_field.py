@@ -123,18 +123,18 @@ def a_model(model="fast_small", appearance=4):
 
 
 def a_step(model):
-    step = make_step(None, model)
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-2)
-    return step
+    train_step = make_step(None, model)
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-2)
+    return train_step
 
 
 @pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
 def test_codes_learn_from_their_own_photographs_and_pictures_have_their_mean(model):
-    scene, step = ball_scene(num_views=8), a_step(a_model(model))
-    optimizer, loader = step.new_optimizer(), RayBatches(scene, step.progress, 0, 64)
+    scene, train_step = ball_scene(num_views=8), a_step(a_model(model))
+    optimizer, loader = train_step.new_optimizer(), RayBatches(scene, train_step.progress, 0, 64)
     for _ in range(3):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-    field, trained = step.model.last.field, list(scene.splits["train"])
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+    field, trained = train_step.objective.model.last.field, list(scene.splits["train"])
     codes = field.codes.detach()
     others = [view for view in range(8) if view not in trained]
     assert float(codes[trained].abs().amax(dim=1).min()) > 0
@@ -149,11 +149,12 @@ def test_codes_learn_from_their_own_photographs_and_pictures_have_their_mean(mod
 
 
 def test_a_new_model_takes_the_codes_of_a_checkpoint():
-    step = a_step(a_model())
-    step(RayBatches(ball_scene(num_views=8), step.progress, 0, 64).at(0, 0), step.new_optimizer())
+    train_step = a_step(a_model())
+    train_step(RayBatches(ball_scene(num_views=8), train_step.progress, 0, 64).at(0, 0), train_step.new_optimizer())
     again = build(composed("train", "model=fast_small", *SMALL, "field.appearance=4").model)
-    again.load_state_dict(step.model.state_dict())
-    pictures = [render_picture(each.eval(), step.rays, 0, "white", 4096).rgb for each in (step.model, again)]
+    model, rays = train_step.objective.model, train_step.objective.rays
+    again.load_state_dict(model.state_dict())
+    pictures = [render_picture(each.eval(), rays, 0, "white", 4096).rgb for each in (model, again)]
     assert torch.equal(*pictures)
 
 

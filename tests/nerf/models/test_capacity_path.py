@@ -30,14 +30,14 @@ def _samples_are_packed():
 def trained(steps, capacity=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     config = composed("train", "model=fast_small", *METHODS["fast_small"], *(STATIC if capacity else ()))
-    step = build_step(config, TrainerSettings(100, accelerator="cpu", precision="32-true"), scene, progress)
-    step.num_steps = 100
+    train_step = build_step(config, TrainerSettings(100, accelerator="cpu", precision="32-true"), scene, progress)
+    train_step.num_steps = 100
     if capacity:
-        step.model.last.sampler.capacity = capacity
-    loader, optimizer = RayBatches(scene, progress, 0, 64), step.new_optimizer()
-    losses = [step(loader.at(0, progress.rays_seen), optimizer).losses for _ in range(steps)]
-    assert step.guard.skipped == 0
-    return losses[-1], statistics(step.model)["train/dropped_samples"]
+        train_step.objective.model.last.sampler.capacity = capacity
+    loader, optimizer = RayBatches(scene, progress, 0, 64), train_step.new_optimizer()
+    losses = [train_step(loader.at(0, progress.rays_seen), optimizer).losses for _ in range(steps)]
+    assert train_step.guard.skipped == 0
+    return losses[-1], statistics(train_step.objective.model)["train/dropped_samples"]
 
 
 def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():

@@ -31,6 +31,7 @@ from nerf_lightning.nerf.samplers.proposal import ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 
 
@@ -63,10 +64,12 @@ CASES = [
 
 
 def a_step(levels, scene, progress, loss):
-    return TrainStep(
+    train_step = TrainStep(
         Objective(levels, rays_of(scene), loss, "random"), optimizer=lambda groups: TableAdam(groups, lr=0.02),
         schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=60, seed=0, tile_points=4096,
     )  # fmt: skip
+    draw_weights(train_step)
+    return train_step
 
 
 @pytest.mark.parametrize(("model", "field", "position", "direction"), CASES)
@@ -75,14 +78,14 @@ def test_it_learns(model, field, position, direction):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     levels = RadianceModel(MODELS[model](lambda: FIELDS[field](POSITIONS[position](), DIRECTIONS[direction]())))
     fit_parts(levels, scene)
-    step = a_step(levels, scene, progress, ProposalLoss() if model == "proposal" else MeanSquaredError())
-    optimizer = step.new_optimizer()
+    train_step = a_step(levels, scene, progress, ProposalLoss() if model == "proposal" else MeanSquaredError())
+    optimizer = train_step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 64)
     losses = []
     for _ in range(30):
-        losses.append(float(step(loader.at(0, progress.rays_seen), optimizer).losses[-1]))
+        losses.append(float(train_step(loader.at(0, progress.rays_seen), optimizer).losses[-1]))
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
-    assert step.guard.skipped == 0
+    assert train_step.guard.skipped == 0
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -96,10 +99,10 @@ def test_every_kind_of_level_learns_known_depths(model):
     levels = RadianceModel(MODELS[model](lambda: FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]())))
     fit_parts(levels, scene)
     plain = ProposalLoss() if model == "proposal" else MeanSquaredError()
-    step = a_step(levels, scene, progress, WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}))
-    loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), step.new_optimizer(), []
+    train_step = a_step(levels, scene, progress, WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}))
+    loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), train_step.new_optimizer(), []
     for _ in range(40):
-        lost.append(float(step(loader.at(0, progress.rays_seen), optimizer).terms["depth"][-1]))
+        lost.append(float(train_step(loader.at(0, progress.rays_seen), optimizer).terms["depth"][-1]))
     assert sum(lost[-5:]) < 0.5 * sum(lost[:5])
 
 
@@ -111,16 +114,17 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     )
     model = RadianceModel({"fine": level})
     fit_parts(model, scene)
-    step = TrainStep(
+    train_step = TrainStep(
         Objective(model, rays_of(scene), MeanSquaredError(), "white"), optimizer=lambda groups: TableAdam(groups),
         schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, sample_budget=1000,
     )  # fmt: skip
-    optimizer = step.new_optimizer()
+    draw_weights(train_step)
+    optimizer = train_step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 512)
     sizes = []
     for _ in range(40):
         sizes.append(progress.batch_rays)
-        step(loader.at(0, progress.rays_seen), optimizer)
+        train_step(loader.at(0, progress.rays_seen), optimizer)
     assert set(sizes) <= {512 >> number for number in range(8)}
     changes = [place for place in range(1, 40) if sizes[place] != sizes[place - 1]]
     assert changes

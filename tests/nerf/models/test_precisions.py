@@ -16,6 +16,7 @@ from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
@@ -40,14 +41,15 @@ def trained(name, scene):
     fit_parts(model, scene)
     show_photographs(model, scene)
     progress, (steps, rays, _) = Progress(), LESS.get(name, (STEPS, RAYS, SIDE))
-    step = TrainStep(
+    train_step = TrainStep(
         Objective(model, rays_of(scene), loss, background_of(name)), build(config.optimizer), build(config.scheduler),
         progress, 2, TILE_POINTS, num_steps=steps,
     )  # fmt: skip
+    draw_weights(train_step)
     set_precision(model, "bfloat16")
-    batches, optimizer = RayBatches(scene, progress, 0, rays), step.new_optimizer()
+    batches, optimizer = RayBatches(scene, progress, 0, rays), train_step.new_optimizer()
     for _ in range(steps):
-        step(batches.at(0, progress.rays_seen), optimizer)
+        train_step(batches.at(0, progress.rays_seen), optimizer)
     return model.eval()
 
 

@@ -46,12 +46,12 @@ def test_rays_of_a_smaller_picture_pass_through_the_middles_of_squares_as_learne
 def test_cameras_can_learn_in_tiles_and_whole():
     scene, shifts = ball_scene(), []
     for tile_points in (None, 200):
-        step = make_step(tile_points)
-        step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far)
-        step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
-        optimizer = step.new_optimizer()
-        step(RayBatches(scene, step.progress, 0, 64).at(0, 0), optimizer)
-        shifts.append(step.rays.shift.detach())
+        train_step = make_step(tile_points)
+        train_step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far)
+        train_step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
+        optimizer = train_step.new_optimizer()
+        train_step(RayBatches(scene, train_step.progress, 0, 64).at(0, 0), optimizer)
+        shifts.append(train_step.objective.rays.shift.detach())
     assert float(shifts[0][list(scene.splits["train"])].abs().min()) > 0
     torch.testing.assert_close(shifts[0], shifts[1], rtol=1e-3, atol=1e-7)
 
@@ -65,9 +65,9 @@ def test_a_training_step_says_which_photograph_it_explains_and_validation_does_n
         return render(rays, background, random)
 
     model.forward = forward
-    step = make_step(None, model)
-    batch = RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
-    step(batch, step.new_optimizer())
+    train_step = make_step(None, model)
+    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
+    train_step(batch, train_step.new_optimizer())
     assert torch.equal(seen[0], batch.pixels.view)
-    RayErrors().of(step.objective, batch, None)
+    RayErrors().of(train_step.objective, batch, None)
     assert seen[1] is None

@@ -202,12 +202,14 @@ def test_rays_share_a_pixel_and_its_area():
 def test_a_step_compares_the_mean_of_a_pixel_s_rays_with_its_photograph(tile_points, background):
     scene = ball_scene()
     model = model_with(2)
-    step = make_step(tile_points, model, background)
-    found, losses = gradients(step, scene)
+    train_step = make_step(tile_points, model, background)
+    found, losses = gradients(train_step, scene)
     batch, random = RayBatches(scene, make_step(None).progress, 0, 64).at(0, 0), batch_random(fold(0, 0, 0), 64)
     behind = random.uniform("background", 3) if background == "random" else torch.ones(64, 3)
     renderings = model(
-        step.rays.of_pixels(batch.pixels, model.subpixels), for_each_ray(behind, 4), random_of_rays(random, 4)
+        train_step.objective.rays.of_pixels(batch.pixels, model.subpixels),
+        for_each_ray(behind, 4),
+        random_of_rays(random, 4),
     )
     target = blend(batch.rgba, behind)
     expected = [(each.rgb.view(64, 4, 3).mean(dim=1) - target).square().mean() for each in renderings]
@@ -259,9 +261,9 @@ def test_losses_that_look_at_samples_and_sides_out_of_range_are_refused_by_name(
     for side in (0, 9):
         with pytest.raises((InputError, ValueError), match="subpixels"):
             Subpixels(side)
-    step = make_step(None)
+    train_step = make_step(None)
     with pytest.raises(InputError, match=r"model\.subpixels=2 .* ProposalLoss looks at the samples"):
         TrainStep(
-            Objective(model_with(2), step.rays, ProposalLoss(), "white"),
-            *(step.build_optimizer, step.schedule, step.progress, 0),
+            Objective(model_with(2), train_step.objective.rays, ProposalLoss(), "white"),
+            *(train_step.build_optimizer, train_step.schedule, train_step.progress, 0),
         )

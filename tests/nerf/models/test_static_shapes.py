@@ -33,16 +33,17 @@ class Operations(TorchDispatchMode):
 
 def operations_of_steps(name, steps, model=None, loss=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    step = static_system(name, scene, progress, 100, model, loss).step
+    train_step = static_system(name, scene, progress, 100, model, loss).train_step
     loader = RayBatches(scene, progress, 0, 64)
     # What is read once in a run (switches, the grid's content) is read on the host.
-    begin_step(step.model, StepContext(0.0, 4, 0))
-    step.model(step.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)
-    optimizer = step.to(torch.device("meta")).new_optimizer()
+    begin_step(train_step.objective.model, StepContext(0.0, 4, 0))
+    train_step.objective.model(train_step.objective.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)
+    train_step.objective.to("meta")
+    optimizer = train_step.new_optimizer()
     lists = []
     for progress.step in steps:
         with Operations() as operations:
-            step(loader.at(0, progress.rays_seen).to("meta"), optimizer)
+            train_step(loader.at(0, progress.rays_seen).to("meta"), optimizer)
         lists.append(operations.seen)
     return lists
 

@@ -33,25 +33,26 @@ from nerf_lightning.nerf.samplers.early_termination import visible_samples
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.training.attempts import restart
 
 
 def a_step(scene, refinement, model=None):
-    step = make_step(None, model, background=scene.background)
-    fit_parts(step.model, scene)
+    train_step = make_step(None, model, background=scene.background)
+    fit_parts(train_step.objective.model, scene)
     refinement.fit_to(scene)
-    step.objective.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
-    return step
+    train_step.objective.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    return train_step
 
 
 def learnt(scene, refinement, model, steps, decay=1.0):
     """What has learned the cameras of a known scene: in each step, from as many rays."""
-    step = a_step(scene, refinement, model)
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
-    step.schedule, step.num_steps = ExponentialDecay(decay_rate=decay), steps
-    loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
+    train_step = a_step(scene, refinement, model)
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
+    train_step.schedule, train_step.num_steps = ExponentialDecay(decay_rate=decay), steps
+    loader, optimizer = RayBatches(scene, train_step.progress, 0, 768), train_step.new_optimizer()
     for _ in range(steps):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-    return step.rays.cameras.map(torch.Tensor.detach)
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+    return train_step.objective.rays.cameras.map(torch.Tensor.detach)
 
 
 @pytest.mark.parametrize("refinement", [
@@ -59,33 +60,33 @@ def learnt(scene, refinement, model, steps, decay=1.0):
 ])  # fmt: skip
 def test_at_first_every_ray_is_as_it_was_to_the_bit(refinement):
     scene = ball_scene()
-    step = a_step(scene, refinement)
+    train_step = a_step(scene, refinement)
     plain = RayGenerator(scene.cameras, scene.near, scene.far)
     pixels = PixelIndex(torch.arange(6), torch.arange(6), torch.arange(6))
-    assert torch.equal(step.rays(pixels).directions, plain(pixels).directions)
-    assert torch.equal(step.rays(pixels).origins, plain(pixels).origins)
+    assert torch.equal(train_step.objective.rays(pixels).directions, plain(pixels).directions)
+    assert torch.equal(train_step.objective.rays(pixels).origins, plain(pixels).origins)
 
 
 def test_only_photographs_that_are_trained_on_move():
     scene = ball_scene()
-    step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.0, weight=1.0))
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
+    train_step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.0, weight=1.0))
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    loader, optimizer = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer()
     for _ in range(3):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-    moved = (step.rays.cameras.c2w.detach() - scene.cameras.c2w).abs().amax(dim=(1, 2))
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+    moved = (train_step.objective.rays.cameras.c2w.detach() - scene.cameras.c2w).abs().amax(dim=(1, 2))
     assert float(moved[:3].min()) > 1e-3
     assert float(moved[3:].max()) == 0.0
 
 
 def test_cameras_are_held_until_there_is_a_scene():
     scene = ball_scene()
-    step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
-    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    loader, optimizer, moved = RayBatches(scene, step.progress, 0, 64), step.new_optimizer(), []
+    train_step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
+    train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    loader, optimizer, moved = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer(), []
     for _ in range(3):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-        moved.append(float(step.rays.refinement.shift.detach().abs().max()))
+        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        moved.append(float(train_step.objective.rays.refinement.shift.detach().abs().max()))
     assert moved[:2] == [0.0, 0.0]
     assert moved[2] > 1e-3
 
@@ -160,7 +161,7 @@ def test_the_penalty_is_the_mean_square_of_what_has_moved_and_without_a_refineme
     torch.nn.init.constant_(refinement.rotation[:1], 0.1)
     assert float(refinement.penalty().detach()) == pytest.approx(0.5 * 3 * 0.01 / 3)
     assert SE3Delta(weight=0.0).penalty() is None
-    rays = a_step(ball_scene(), NoRefinement()).rays
+    rays = a_step(ball_scene(), NoRefinement()).objective.rays
     assert not list(rays.parameters())
     assert not rays.state_dict()
     assert rays.penalty() is None
@@ -217,11 +218,11 @@ def test_who_moved_far_is_told_from_what_all_did():
 
 def test_a_restart_puts_the_cameras_back():
     scene = ball_scene()
-    step = a_step(scene, SE3Delta(), tiny_model(density_bias=0.5))
-    torch.nn.init.normal_(step.rays.refinement.rotation)
-    step.restart(torch.optim.SGD(step.rays.parameters(), lr=1.0))
-    assert torch.equal(step.rays.cameras.c2w, scene.cameras.c2w)
-    assert torch.equal(step.rays.refined((0, 1, 2)).c2w[:3], scene.cameras.c2w[:3])
+    train_step = a_step(scene, SE3Delta(), tiny_model(density_bias=0.5))
+    torch.nn.init.normal_(train_step.objective.rays.refinement.rotation)
+    restart(train_step, torch.optim.SGD(train_step.objective.rays.parameters(), lr=1.0))
+    assert torch.equal(train_step.objective.rays.cameras.c2w, scene.cameras.c2w)
+    assert torch.equal(train_step.objective.rays.refined((0, 1, 2)).c2w[:3], scene.cameras.c2w[:3])
 
 
 @pytest.mark.parametrize("blended", [1.0, 0.5])

@@ -2,11 +2,13 @@ import logging
 import signal
 from types import SimpleNamespace
 
+import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.training.callbacks import collapse_guard
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard, is_constant
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.launch.preemption import stop_signals
@@ -20,12 +22,17 @@ class StubTrainer(Trainer):
         pass
 
 
+@pytest.fixture(autouse=True)
+def stubs_restart(monkeypatch):
+    monkeypatch.setattr(collapse_guard, "restart", lambda train_step, optimizer: train_step.restart())
+
+
 class StubSystem:
     def __init__(self, alive):
         self.progress = SimpleNamespace(step=0, restarts=0, attempt=0, rays_seen=0)
         self.alive = alive
         self.restarts = 0
-        self.step = self  # the system's step, too
+        self.train_step = self  # the system's, too
 
     def optimizers(self):
         return SimpleNamespace(optimizer=None)
@@ -38,7 +45,7 @@ class StubSystem:
         pixels = PixelIndex(number, number, number)
         return {"step": StepOutput(level, {}, level, light, light, target, torch.ones(64), pixels)}
 
-    def restart(self, optimizer):
+    def restart(self):
         self.restarts += 1
         self.progress.restarts += 1
         self.progress.attempt += 1

@@ -20,6 +20,7 @@ from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.callbacks.monitor import level_scalars
 from nerf_lightning.training.callbacks.ray_histograms import PARTS, look_along, write_shares
 from nerf_lightning.training.step import TrainStep
@@ -49,14 +50,15 @@ def test_the_psnr_is_that_of_the_colours_whatever_the_loss_is(model, loss):
     scene, progress = ball_scene(num_views=8, size=16), Progress()
     built = build(config.model)
     fit_parts(built, scene)
-    step = TrainStep(
+    train_step = TrainStep(
         Objective(built, rays_of(scene), L1() if loss == "L1" else build(config.loss), "white"),
         lambda groups: torch.optim.Adam(groups), ExponentialDecay(), progress, 0, 4096, num_steps=100,
     )  # fmt: skip
+    draw_weights(train_step)
     if loss == "robust":
-        step.objective.loss.threshold.fill_(0.01)  # at first it leaves nothing out
+        train_step.objective.loss.threshold.fill_(0.01)  # at first it leaves nothing out
     batch = RayBatches(scene, progress, 0, 128).at(0, 0)
-    seen = step.gradients(batch)
+    seen = train_step.gradients(batch, train_step.key)
     error = (seen.rgb - seen.target).square().mean()
     torch.testing.assert_close(psnr(seen.color_errors[-1]), psnr(error))
     if loss == "mse":
@@ -69,32 +71,32 @@ def a_system(name):
     progress, scene = Progress(), ball_scene(num_views=6)
     model = fast_model(RaggedLevel) if name == "fast_dense" else tiny_model()
     system = static_system(name, scene, progress, 10, model=model)
-    return system.step, RayBatches(scene, progress, 0, 64).at(0, 0)
+    return system.train_step, RayBatches(scene, progress, 0, 64).at(0, 0)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])
 def test_looking_changes_nothing_that_training_reads(name):
-    step, batch = a_system(name)
-    step.gradients(batch)
-    before = copy.deepcopy(step.model.state_dict())
-    gradients = [parameter.grad.clone() for parameter in step.model.parameters()]
+    train_step, batch = a_system(name)
+    train_step.gradients(batch, train_step.key)
+    before = copy.deepcopy(train_step.objective.model.state_dict())
+    gradients = [parameter.grad.clone() for parameter in train_step.objective.model.parameters()]
     generator = torch.get_rng_state()
-    look_along(step, batch.pixels, 7, contracted_spacing=False)
-    assert step.model.training
-    for key, value in step.model.state_dict().items():
+    look_along(train_step, batch.pixels, 7, contracted_spacing=False)
+    assert train_step.objective.model.training
+    for key, value in train_step.objective.model.state_dict().items():
         assert torch.equal(value, before[key]), key
-    for parameter, gradient in zip(step.model.parameters(), gradients, strict=True):
+    for parameter, gradient in zip(train_step.objective.model.parameters(), gradients, strict=True):
         assert torch.equal(parameter.grad, gradient)
     assert torch.equal(torch.get_rng_state(), generator)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])
 def test_tiles_do_not_show(name):
-    step, batch = a_system(name)
-    whole = look_along(step, batch.pixels, 7, contracted_spacing=False)
-    step.tiles.points = 300
-    parts = look_along(step, batch.pixels, 7, contracted_spacing=False)
-    assert list(whole) == list(step.model.level_names)
+    train_step, batch = a_system(name)
+    whole = look_along(train_step, batch.pixels, 7, contracted_spacing=False)
+    train_step.tiles.points = 300
+    parts = look_along(train_step, batch.pixels, 7, contracted_spacing=False)
+    assert list(whole) == list(train_step.objective.model.level_names)
     for level in whole:
         torch.testing.assert_close(parts[level], whole[level])
 

@@ -16,10 +16,12 @@ from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.nan_guard import NanGuard
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.step_guard import first_not_finite
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -31,7 +33,7 @@ class BreaksAtStep(MeanSquaredError):
     def __call__(self, renderings, target):
         coarse, fine = super().__call__(renderings, target)["color"]
         rate = self.holder[0].optimizers().param_groups[0]["lr"]
-        broken = self.step <= self.holder[0].step.progress.step < self.until and rate > self.limit
+        broken = self.step <= self.holder[0].train_step.progress.step < self.until and rate > self.limit
         return {"color": torch.stack([coarse, fine * float("nan") if broken else fine])}
 
 
@@ -42,8 +44,9 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
     optimizer = optimizer or partial(torch.optim.Adam, lr=0.01)
     schedule = ExponentialDecay(decay_rate=1.0, decay_steps=1)
     model = tiny_model(density_bias=0.5)
-    step_of_training = TrainStep(Objective(model, rays_of(scene), loss, "white"), optimizer, schedule, progress, 0)
-    system = RadianceFieldSystem(step_of_training, record)
+    train_step = TrainStep(Objective(model, rays_of(scene), loss, "white"), optimizer, schedule, progress, 0)
+    draw_weights(train_step)
+    system = RadianceFieldSystem(train_step, record)
     loss.step, loss.until, loss.limit, loss.holder = step, until, limit, (system,)
     data = RayDataModule(scene, progress, 0, batch_rays=16, crop_steps=3, val_rays=16)
     folder.mkdir(exist_ok=True)
@@ -81,7 +84,7 @@ def test_without_a_checkpoint_it_says_so(tmp_path):
 
 def test_a_few_bad_steps_are_left_out_and_no_more(tmp_path, caplog):
     system = run(tmp_path, NanGuard(patience=4), until=15)
-    assert system.step.guard.state() == [3, 0]
+    assert system.train_step.guard.state() == [3, 0]
     assert system.trainer.global_step == 30
     assert "Rolled back" not in caplog.text
 
@@ -107,18 +110,22 @@ def test_a_rollback_goes_on_from_the_last_good_checkpoint_as_it_was_saved_at_a_l
         assert all(torch.equal(value, saved["state_dict"][key]) for key, value in system.state_dict().items())
         for number, kept in saved["optimizer_states"][0]["state"].items():
             assert all(torch.equal(torch.as_tensor(moments[number][name]), kept[name]) for name in kept)
-        seen.append((system.step.progress.step, system.step.progress.rays_seen))
+        seen.append((system.train_step.progress.step, system.train_step.progress.rays_seen))
 
     monkeypatch.setattr(NanGuard, "_roll_back", look)
     with caplog.at_level(logging.WARNING):
         system = run(tmp_path, NanGuard(on_nan="rollback", patience=4), limit=0.006)
     assert seen == [(10, 160)]
     assert system.trainer.global_step == 30
-    assert (system.step.progress.attempt, system.step.progress.rollbacks, system.step.progress.restarts) == (1, 1, 0)
-    assert system.step.progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
+    assert (
+        system.train_step.progress.attempt,
+        system.train_step.progress.rollbacks,
+        system.train_step.progress.restarts,
+    ) == (1, 1, 0)
+    assert system.train_step.progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
     assert [group["lr"] for group in system.optimizers().param_groups] == [pytest.approx(0.005)]
-    assert system.step.guard.state() == [4, 0]
-    assert system.step.broken_weights() is None
+    assert system.train_step.guard.state() == [4, 0]
+    assert first_not_finite(system.train_step.objective.named_weights()) is None
     assert "since step 13" in caplog.text
     assert f"Rolled back to the checkpoint {tmp_path}/checkpoints/last.ckpt" in caplog.text
     assert "attempt 2, rollback 1 of at most 3, base learning rate 0.005" in caplog.text
@@ -136,7 +143,7 @@ def test_the_rate_falls_with_every_rollback_and_they_are_counted(tmp_path, caplo
 
 def test_a_rollback_without_a_checkpoint_begins_anew_at_a_lower_rate(tmp_path, caplog):
     system = run(tmp_path, NanGuard(on_nan="rollback", patience=2), step=2, limit=0.006)
-    assert (system.step.progress.attempt, system.step.progress.rollbacks) == (1, 1)
+    assert (system.train_step.progress.attempt, system.train_step.progress.rollbacks) == (1, 1)
     assert system.optimizers().param_groups[0]["lr"] == pytest.approx(0.005)
     assert "Rolled back to the beginning, with new weights" in caplog.text
 
@@ -148,7 +155,7 @@ def test_a_resume_keeps_the_lowered_rate_and_the_attempt(tmp_path):
     whole = run(tmp_path / "whole", guard(), limit=0.006)
     run(tmp_path / "parts", guard(), limit=0.006, max_steps=15)
     resumed = run(tmp_path / "parts", guard(), limit=0.006, resume=tmp_path / "parts" / "checkpoints" / "last.ckpt")
-    assert resumed.step.progress == whole.step.progress
+    assert resumed.train_step.progress == whole.train_step.progress
     assert resumed.optimizers().param_groups[0]["lr"] == whole.optimizers().param_groups[0]["lr"]
     assert all(torch.equal(value, whole.state_dict()[key]) for key, value in resumed.state_dict().items())
 
@@ -168,8 +175,8 @@ def test_weights_that_are_not_finite_are_noticed_and_never_saved(tmp_path, caplo
     guard = NanGuard(on_nan="rollback", patience=50, every_steps=7)
     system = run(tmp_path, guard, step=1000, optimizer=partial(Spoils, lr=0.01), max_steps=25)
     assert "The weights of step 14 are not finite numbers (first those of levels.coarse.field" in caplog.text
-    assert system.step.broken_weights() is None
-    assert system.step.progress.rollbacks == 1
+    assert first_not_finite(system.train_step.objective.named_weights()) is None
+    assert system.train_step.progress.rollbacks == 1
 
 
 def test_settings_that_make_no_sense_are_refused():

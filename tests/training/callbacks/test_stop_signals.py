@@ -3,7 +3,12 @@
 import signal
 from types import SimpleNamespace
 
+import pytest
+from lightning.pytorch import Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
+
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.launch.preemption import stop_signals
 
 
 def stopped(signals):
@@ -34,3 +39,21 @@ def test_the_first_ctrl_c_after_the_stop_file_lets_the_job_save(tmp_path, monkey
     assert not ended
     signals._handle(signal.SIGINT, None)
     assert ended == [130]
+
+
+class ToldToStopAsItStarts(BoringModel):
+    def zero_grad(self, set_to_none=True):
+        """Be asked to stop when Lightning listens, and no step was taken."""
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_before_the_first_step_ends_the_training_at_once(tmp_path):
+    before = {number: signal.getsignal(number) for number in stop_signals()}
+    trainer = Trainer(
+        default_root_dir=tmp_path, max_steps=2, accelerator="cpu", logger=False, callbacks=[StopSignals()],
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, limit_val_batches=0,
+    )  # fmt: skip
+    with pytest.raises(SystemExit) as left:
+        trainer.fit(ToldToStopAsItStarts())
+    assert (left.value.code, trainer.global_step) == (128 + signal.SIGTERM, 0)
+    assert {number: signal.getsignal(number) for number in stop_signals()} == before

@@ -57,7 +57,7 @@ def trainer():
 
 
 def a_system(step):
-    return SimpleNamespace(step=SimpleNamespace(progress=SimpleNamespace(step=step), num_steps=200_000))
+    return SimpleNamespace(train_step=SimpleNamespace(progress=SimpleNamespace(step=step), num_steps=200_000))
 
 
 def test_a_resumed_run_takes_up_its_schedule_at_once_and_a_new_one_keeps_its_length():
@@ -66,10 +66,10 @@ def test_a_resumed_run_takes_up_its_schedule_at_once_and_a_new_one_keeps_its_len
     budget.load_state_dict({"used": 5.0})
     system = a_system(step=103)
     budget.on_train_start(trainer(), system)
-    assert system.step.num_steps == 206
+    assert system.train_step.num_steps == 206
     system = a_system(step=0)
     TimeBudget(seconds=10.0).on_train_start(trainer(), system)
-    assert system.step.num_steps == 200_000
+    assert system.train_step.num_steps == 200_000
 
 
 def test_a_run_that_had_no_budget_has_all_of_it_from_where_it_is_gone_on_with(monkeypatch):
@@ -79,13 +79,13 @@ def test_a_run_that_had_no_budget_has_all_of_it_from_where_it_is_gone_on_with(mo
     budget.on_train_start(trainer(), system)
     for step in (501, 502, 503):  # the first is not counted
         now[0] += 1.0
-        system.step.progress.step = step
+        system.train_step.progress.step = step
         budget.on_train_batch_end(trainer(), system, None, None, 0)
-    assert system.step.num_steps == 500 + 3 * 10.0 / 2.0
+    assert system.train_step.num_steps == 500 + 3 * 10.0 / 2.0
     resumed = TimeBudget(seconds=20.0)
     resumed.load_state_dict(budget.state_dict())
     resumed.on_train_start(trainer(), system)
-    assert system.step.num_steps == 500 + 3 * 20.0 / 2.0
+    assert system.train_step.num_steps == 500 + 3 * 20.0 / 2.0
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no process is stopped there")
@@ -113,10 +113,10 @@ def lines_of(monkeypatch, caplog, seconds_of_steps, num_steps):
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     caplog.set_level("INFO")
     progress, system = TrainingProgress(line_seconds=0.0), a_system(step=0)
-    system.step.progress.rays_seen = 0
+    system.train_step.progress.rays_seen = 0
     output = {"step": SimpleNamespace(losses=torch.ones(1), color_errors=torch.ones(1))}
     progress.on_train_start(create_autospec(Trainer, instance=True, global_step=0), system)
-    for step, (passed, system.step.num_steps) in enumerate(zip(seconds_of_steps, num_steps, strict=True), 1):
+    for step, (passed, system.train_step.num_steps) in enumerate(zip(seconds_of_steps, num_steps, strict=True), 1):
         now[0] += passed
         taken = create_autospec(Trainer, instance=True, global_step=step, estimated_stepping_batches=max(num_steps))
         progress.on_train_batch_end(taken, system, output, None, 0)

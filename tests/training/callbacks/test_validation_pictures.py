@@ -11,8 +11,9 @@ from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.training.callbacks import pictures, watcher
 
 
-def a_run(scene, step, folder):
-    system = SimpleNamespace(model=step.model, rays=step.rays, step=step, eval=step.model.eval, train=step.model.train)
+def a_run(scene, train_step, folder):
+    model, rays = train_step.objective.model, train_step.objective.rays
+    system = SimpleNamespace(model=model, rays=rays, train_step=train_step, eval=model.eval, train=model.train)
     trainer = SimpleNamespace(
         is_global_zero=True,
         global_step=7,

@@ -60,7 +60,7 @@ def run(config: DictConfig) -> float:
     }
     result |= {
         "machine": bench.settings.describe(),
-        "tile_points": None if bench.step.recorded else bench.settings.tile_points,
+        "tile_points": None if bench.train_step.gradients.replays else bench.settings.tile_points,
         "batch_rays": bench.batch.num_rays,
         "training_flops_per_ray": flops,
         "peak_memory_gigabytes": peak,
@@ -108,12 +108,12 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "loaded": loaded_steps,
         "render": partial(bench.render, render_rays),
         "render_plain": partial(bench.render, render_rays, plain=True),
-        **({"one by one": partial(bench.train_one_by_one, steps)} if bench.step.recorded else {}),
+        **({"one by one": partial(bench.train_one_by_one, steps)} if bench.train_step.gradients.replays else {}),
         **{f"train on {count}": partial(_on_threads, count, partial(bench.train, steps)) for count in threads},
     }
     seconds = _interleaved(kinds, config.rounds)
     train, wait = seconds["train"], np.array(loaded_steps.waits[1:])
-    flops, train_rays = flops_per_ray(bench.step, bench.batch), bench.batch.num_rays * steps
+    flops, train_rays = flops_per_ray(bench.train_step, bench.batch), bench.batch.num_rays * steps
     rate, matrix_rate = train_rays * flops / train, MATRIX_FLOPS / seconds["matrix"]
     rows = {
         "training rays/s": train_rays / train,
@@ -127,9 +127,9 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "rendering rays/s": render_rays / seconds["render"],
         "rendering, times plain float32": seconds["render_plain"] / seconds["render"],
     }
-    if bench.step.recorded:
+    if bench.train_step.gradients.replays:
         rows["training, times kernels launched one by one"] = seconds["one by one"] / train
-    stages = [stage_seconds(bench.step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
+    stages = [stage_seconds(bench.train_step, bench.batch, bench.optimizer) for _ in range(config.rounds)]
     for name in stages[0]:
         rows[f"{name}, share of a step"] = np.array([each[name] for each in stages]) * steps / train
     for count in threads:

@@ -29,7 +29,9 @@ def bench(nerf, tmp_path):
 
 def test_bench_measures_a_packed_model(bench, monkeypatch):
     tiles, train = [], Bench.train
-    monkeypatch.setattr(Bench, "train", lambda self, steps: (tiles.append(self.step.tiles.points), train(self, steps)))
+    monkeypatch.setattr(
+        Bench, "train", lambda self, steps: (tiles.append(self.train_step.tiles.points), train(self, steps))
+    )
     threads, set_threads = [], torch.set_num_threads
     monkeypatch.setattr("nerf_lightning.extensions.bench.commands.bench.num_cores", lambda: 2)
     monkeypatch.setattr(torch, "set_num_threads", lambda count: (threads.append(count), set_threads(count)))

@@ -1,0 +1,47 @@
+"""Attempts of a run: their weights are drawn from seed and number, and a guard begins another where one fails."""
+
+import torch
+from torch.optim import Optimizer
+
+from nerf_lightning.nerf.randomness import fold
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.gradients.recorded import RecordedGradients
+from nerf_lightning.training.step import TrainStep
+
+
+def draw_weights(train_step: TrainStep) -> None:
+    """Draw the weights of this attempt, or take those that it starts from."""
+    objective = train_step.objective
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(fold(train_step.seed, train_step.progress.attempt, "weights"))
+        objective.reset_parameters()
+    if train_step.start_weights is not None:
+        objective.model.load_state_dict(train_step.start_weights)
+    _forget_recordings(train_step)
+
+
+def restart(train_step: TrainStep, optimizer: Optimizer) -> None:
+    """Begin a new attempt with fresh weights, optimizer and order of rays."""
+    train_step.progress.restart()
+    draw_weights(train_step)
+    optimizer.state.clear()
+
+
+def count_rollback(train_step: TrainStep, former: Progress, skipped: int) -> None:
+    """Begin a new attempt, with other random numbers, from the state that was just restored.
+
+    Args:
+        train_step: of the run.
+        former: where the run stood before.
+        skipped: steps that were left out before.
+    """
+    progress = train_step.progress
+    progress.attempt, progress.rollbacks = former.attempt + 1, former.rollbacks + 1
+    train_step.guard.restore([skipped, 0], train_step.device)
+    _forget_recordings(train_step)
+
+
+def _forget_recordings(train_step: TrainStep) -> None:
+    """Free the memory of all recordings; a further step makes new ones, of where everything lies then."""
+    if isinstance(train_step.gradients, RecordedGradients):
+        train_step.gradients.recordings.clear()
