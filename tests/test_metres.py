@@ -15,7 +15,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record, scene_record
 from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.nerf.geometry.frames import similarity, told_length
+from nerf_lightning.nerf.geometry.world_frame import similarity, told_length
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, depth_range, make_shots
 

@@ -18,7 +18,7 @@ COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.t
 DOCUMENTS = ("tests/test_documents.py", "tests/test_packaging.py")
 """They are of the whole project, and name commands and files of extensions."""
 TRIED = (
-    *("test_configs.py", "test_key_meanings.py", "test_reader_settings.py", "test_kept_checkpoints.py"),
+    *("test_configs.py", "test_setting_rules.py", "test_reader_settings.py", "test_kept_checkpoints.py"),
     *("test_cli.py", "test_help.py", "test_completion.py", "test_own_parts.py", "test_train_eval_render.py"),
     *("test_export.py", "test_doctor.py", "test_table.py", "test_selftest.py"),
 )

@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
-from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, poses_from_user, unit_of
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 SAME_POSE = 1e-3

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user, unit_of
 from nerf_lightning.nerf.types.scene import Scene
 
 CLOSE = 1e-5

@@ -182,7 +182,7 @@ def explained(command: str) -> Iterator[None]:
     except (KeyboardInterrupt, Exception) as error:
         if isinstance(error, KeyboardInterrupt) or was_interrupted():
             sys.exit(INTERRUPTED)
-        from nerf_lightning.config.messages import paragraph
+        from nerf_lightning.config.error_messages import paragraph
 
         message = paragraph(error, command)
         if message is None:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from rich.text import Text
 
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.key_meanings import PLACES
+from nerf_lightning.config.setting_rules import PLACES
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine

@@ -3,9 +3,9 @@
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import as_known, open_checkpoint
+from nerf_lightning.evaluation.metric_lines import metric_lines
 from nerf_lightning.evaluation.protocol import measured_of
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder

@@ -8,8 +8,8 @@ from typing import Any
 import yaml
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
-from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_a_class
 from nerf_lightning.config.overrides import leaves, quoted
+from nerf_lightning.config.setting_rules import PLACES, Trust, meaning_of, names_a_class
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.errors import InputError

@@ -8,8 +8,8 @@ from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels, seen_at
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.doctor.features import THUMBNAIL
 from nerf_lightning.doctor.matches import Matches, nearest_views
-from nerf_lightning.nerf.rendering.blending import at_evaluation
+from nerf_lightning.nerf.rendering.background import at_evaluation
 
 # Mean difference of thumbnails, in units of their contrast.
 SAME = 0.012

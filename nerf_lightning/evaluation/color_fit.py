@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.nerf.matmul_precision import disable_autocast
-from nerf_lightning.nerf.rendering.blending import in_other_light
+from nerf_lightning.nerf.rendering.background import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 from nerf_lightning.nerf.row_chunks import row_chunks
 

@@ -20,13 +20,13 @@ from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.nerf.geometry.world_frame import told_length
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
-from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.rendering.background import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
 
 log = logging.getLogger(__name__)

@@ -18,11 +18,11 @@ from torch import nn
 
 from nerf_lightning import __version__
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.config.key_meanings import fingerprint, meaning_of
 from nerf_lightning.config.overrides import leaves
+from nerf_lightning.config.setting_rules import fingerprint, meaning_of
 from nerf_lightning.evaluation.metrics_files import as_text
 from nerf_lightning.files.yaml_files import plain_yaml
-from nerf_lightning.nerf.rendering.blending import at_evaluation
+from nerf_lightning.nerf.rendering.background import at_evaluation
 from nerf_lightning.nerf.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]

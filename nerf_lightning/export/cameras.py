@@ -17,8 +17,8 @@ from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import require_printable
-from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 

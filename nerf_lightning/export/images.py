@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from nerf_lightning.data.pixels.images import ENDINGS
+from nerf_lightning.data.pixels.picture_files import ENDINGS
 from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
@@ -20,8 +20,8 @@ from nerf_lightning.files.made_folders import child_of, file_name, make_folder
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
-from nerf_lightning.nerf.geometry.frames import directions_to_user, told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, told_length
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import save_png, to_bytes

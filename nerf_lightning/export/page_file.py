@@ -28,9 +28,9 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.rendering.blending import at_evaluation, photograph
+from nerf_lightning.nerf.geometry.world_frame import gaps_around
+from nerf_lightning.nerf.rendering.background import at_evaluation, photograph
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 

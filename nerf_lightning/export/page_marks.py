@@ -18,7 +18,7 @@ import torch
 
 from nerf_lightning.files.json_files import number, read_json
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 Marks = dict[str, list[dict[str, Any]]]

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator, for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex, RayBundle, Target
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.nerf.types.scene import Scene

@@ -12,15 +12,15 @@ from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands.export import export as export_checkpoint
 from nerf_lightning.config.compose import compose_config, composed_job
+from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.open_checkpoint import open_checkpoint
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user, unit_of
 from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture

@@ -8,8 +8,8 @@ from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands.train import train as train_in_folder
 from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.config.compose import composed_job
+from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.instantiate import require_fitting_values
-from nerf_lightning.config.messages import in_words
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.errors import InputError

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError

@@ -26,8 +26,8 @@ from omegaconf.errors import OmegaConfBaseException
 from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
-from nerf_lightning.config.key_meanings import fingerprint
 from nerf_lightning.config.overrides import key_of, leaves, to_type
+from nerf_lightning.config.setting_rules import fingerprint
 from nerf_lightning.files.atomic import persistently, whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import child_of, make_folder, require_no_way_out, require_run

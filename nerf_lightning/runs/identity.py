@@ -5,8 +5,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.key_meanings import fingerprint, meaning_of
 from nerf_lightning.config.overrides import flatten
+from nerf_lightning.config.setting_rules import fingerprint, meaning_of
 
 
 def run_identity(config: DictConfig) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
-from nerf_lightning.config.key_meanings import PLACES, meaning_of
+from nerf_lightning.config.setting_rules import PLACES, meaning_of
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import mapping, number, read_json_object

@@ -1,6 +1,6 @@
 """The overrides that a run or a sweep was started with, repeated where it is gone on with by its folder's name.
 
-The folder may come from anybody: what the table in config/key_meanings.py does not trust to files, and the choice of
+The folder may come from anybody: what the table in config/setting_rules.py does not trust to files, and the choice of
 loggers, is taken from the command line alone.
 """
 
@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
-from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, meaning_of
+from nerf_lightning.config.setting_rules import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, meaning_of
 from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerf_lightning.compute.slurm import was_requeued
-from nerf_lightning.config.messages import paragraph
+from nerf_lightning.config.error_messages import paragraph
 from nerf_lightning.files.json_files import number, read_json, write_json
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.runs.identity import settings_digest

@@ -4,8 +4,8 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerf_lightning.config.key_meanings import meaning_of
 from nerf_lightning.config.overrides import leaves
+from nerf_lightning.config.setting_rules import meaning_of
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 from nerf_lightning.evaluation.protocol import differences
 from nerf_lightning.files.yaml_files import read_plain_yaml

@@ -14,7 +14,7 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.config.compose import chosen
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.data.pixels.decoding import photograph_hashes
+from nerf_lightning.data.pixels.decoded_photographs import photograph_hashes
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.progress import Progress

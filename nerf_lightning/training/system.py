@@ -17,7 +17,7 @@ from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.psnr import psnr
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress

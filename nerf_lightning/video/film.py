@@ -16,7 +16,7 @@ from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.compute.ranks import processes_here
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import told_length
+from nerf_lightning.nerf.geometry.world_frame import told_length
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.encoding import CODECS, require_encoder
 from nerf_lightning.video.exr import exr_channels, require_openexr, save_exr

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import ScratchFolder, child_of, empty_ours, make_folder, make_ours
 from nerf_lightning.messages.console import tracked

@@ -17,12 +17,12 @@ from nerf_lightning.nerf.geometry.cameras import (
     seen_at,
 )
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
-from nerf_lightning.nerf.geometry.frames import poses_from_user, told_length, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.near_far_of_new_views import near_and_far_from
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user, told_length, unit_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture

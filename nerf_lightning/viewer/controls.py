@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
-from nerf_lightning.nerf.geometry.frames import points_to_user
+from nerf_lightning.nerf.geometry.world_frame import points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient

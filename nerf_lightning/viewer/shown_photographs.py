@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 

@@ -8,7 +8,7 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 
 
 def rays_of(scene, name):

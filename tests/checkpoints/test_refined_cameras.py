@@ -10,8 +10,8 @@ from support.wrong_cameras import with_noise
 from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
 from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user, similarity
 from nerf_lightning.nerf.refinements.displacements import align_untrained_cameras
 
 SCENE = ball_scene()

@@ -8,9 +8,9 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.checkpoints.same_capture import changes, depth_sums, require_same_capture
-from nerf_lightning.data.pixels import decoding as hashes
-from nerf_lightning.data.pixels.decoding import photograph_hashes
-from nerf_lightning.nerf.geometry.frames import poses_from_user
+from nerf_lightning.data.pixels import decoded_photographs as hashes
+from nerf_lightning.data.pixels.decoded_photographs import photograph_hashes
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 
 SCENE = ball_scene()

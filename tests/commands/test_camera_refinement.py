@@ -9,7 +9,7 @@ from support.running import FAST, FAST_PATH
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.evaluation import camera_fit
-from nerf_lightning.nerf.geometry.frames import poses_from_user
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user
 
 SETTINGS = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop", "trainer.max_steps"))],
             *FAST_PATH, "trainer.max_steps=20", "final.video=false")  # fmt: skip

@@ -19,7 +19,7 @@ from support.captures import picture, pose
 from support.running import FAST, said, saved, start, start_code
 from support.systems import POSIX
 
-from nerf_lightning.config.messages import paragraph
+from nerf_lightning.config.error_messages import paragraph
 from nerf_lightning.messages.errors import InputError
 
 QUIET = (

@@ -21,7 +21,13 @@ from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
-from nerf_lightning.nerf.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
+from nerf_lightning.nerf.geometry.world_frame import (
+    points_from_user,
+    points_to_user,
+    poses_from_user,
+    similarity,
+    unit_of,
+)
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler

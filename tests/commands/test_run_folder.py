@@ -11,7 +11,7 @@ from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
-from nerf_lightning.config.key_meanings import fingerprint
+from nerf_lightning.config.setting_rules import fingerprint
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import ResumePoint, open_run, write_config

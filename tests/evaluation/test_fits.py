@@ -17,7 +17,7 @@ from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.evaluation.protocol import differences
 from nerf_lightning.nerf.models.render_image import Picture
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 
 GAINS = torch.tensor([1.6, 0.7, 1.1])

@@ -14,7 +14,7 @@ from nerf_lightning.commands.export import page_path
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.page import PageExport
-from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.geometry.world_frame import similarity
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, lay_path, make_shots

@@ -17,7 +17,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
-from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
+from nerf_lightning.nerf.geometry.world_frame import similarity, upright_rotation
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel

@@ -13,8 +13,8 @@ from support.shiny_ball import all_around, beside, read_page, record_of, shiny_m
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.page_file import average_view, sway
 from nerf_lightning.export.page_marks import read_marks
-from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.world_frame import similarity
 
 TURN = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 RECORD = record_of(all_around(), to_user=similarity(TURN, torch.tensor([50.0, -3.0, 2.0]), 3.0))

@@ -11,7 +11,7 @@ from support.page_in_browser import drawn, press, psnr, shot, wait_for, wait_unt
 from support.shiny_ball import RADIUS, all_around, beside, read_page, record_of, shiny_model
 
 from nerf_lightning.export.page import PageExport
-from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.geometry.world_frame import similarity
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from support.running import start_code
 READ = """
 import json, os, resource, sys, warnings
 from pathlib import Path
-from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.data.readers.colmap_files import BinaryFiles, TextFiles
 from nerf_lightning.data.readers.llff import _registered
 from nerf_lightning.data.readers.ply_points import read_ply_points

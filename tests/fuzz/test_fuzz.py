@@ -27,7 +27,7 @@ from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
 from nerf_lightning.commands import report, table
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
-from nerf_lightning.data.pixels.images import image_size, read_rgba
+from nerf_lightning.data.pixels.picture_files import image_size, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.evaluation.lpips import LPIPS, load_lpips

@@ -9,7 +9,7 @@ from nerf_lightning.doctor.check import Evidence
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes, inverted
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.poses import CHECKS
-from nerf_lightning.nerf.geometry.frames import focus_point
+from nerf_lightning.nerf.geometry.world_frame import focus_point
 
 
 @dataclass(frozen=True)

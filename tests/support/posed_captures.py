@@ -14,8 +14,8 @@ from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -12,7 +12,7 @@ from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.psnr import psnr
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.build_step import build_step
 

@@ -15,7 +15,7 @@ from support.videos import read_video
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.geometry.world_frame import similarity
 from nerf_lightning.video import encoding, exr
 from nerf_lightning.video.encoding import pad_to_even, write_animation, write_video
 from nerf_lightning.video.film import film

@@ -11,7 +11,7 @@ from support.scenes import ball_scene
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
-from nerf_lightning.nerf.geometry.frames import points_from_user, similarity, upright_rotation
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, similarity, upright_rotation
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, read_keyframes

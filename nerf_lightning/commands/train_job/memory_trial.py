@@ -25,7 +25,7 @@ from nerf_lightning.nerf.models.ragged_level import average_counts
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.part import reset_statistics
-from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.rendering.background import background_colors
 from nerf_lightning.nerf.row_chunks import CHUNK_PIXELS
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import LensModel

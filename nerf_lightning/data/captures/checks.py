@@ -15,9 +15,9 @@ from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal, listed, require_printable
-from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.geometry.lens_checks import lens_faults
 from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.nerf.geometry.world_frame import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, SceneRecord
 
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9

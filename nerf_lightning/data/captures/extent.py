@@ -14,7 +14,7 @@ from nerf_lightning.data.captures.checks import FARTHEST
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
-from nerf_lightning.nerf.geometry.frames import (
+from nerf_lightning.nerf.geometry.world_frame import (
     FORWARD_FACING,
     LARGEST_UNIT,
     LEAST_UNIT,

@@ -14,7 +14,7 @@ from nerf_lightning.data.captures.checks import usable
 from nerf_lightning.data.captures.intrinsics import cameras_of
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
-from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.plain_background import background_for
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import Reader

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, cameras_as_given
-from nerf_lightning.data.pixels.images import QUARTER_TURNS, downscaled_size, read_header
+from nerf_lightning.data.pixels.picture_files import QUARTER_TURNS, downscaled_size, read_header
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 

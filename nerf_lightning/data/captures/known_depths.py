@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.pixels.images import read_depth
+from nerf_lightning.data.pixels.picture_files import read_depth
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels, seen_at

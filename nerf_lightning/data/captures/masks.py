@@ -7,8 +7,8 @@ from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
-from nerf_lightning.data.pixels.decoding import of_one_shape
-from nerf_lightning.data.pixels.images import image_size, read_header, read_mask
+from nerf_lightning.data.pixels.decoded_photographs import of_one_shape
+from nerf_lightning.data.pixels.picture_files import image_size, read_header, read_mask
 from nerf_lightning.files.regular import contents
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from urllib.parse import unquote
 
 from nerf_lightning.data.pixels.formats import HEIC_ENDINGS, UNREAD, decoders
-from nerf_lightning.data.pixels.images import ENDINGS
+from nerf_lightning.data.pixels.picture_files import ENDINGS
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

@@ -13,8 +13,8 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.captures.scene import Coordinates
 from nerf_lightning.data.captures.splits import apart
-from nerf_lightning.data.pixels.decoding import upright_size
-from nerf_lightning.data.pixels.images import ENDINGS
+from nerf_lightning.data.pixels.decoded_photographs import upright_size
+from nerf_lightning.data.pixels.picture_files import ENDINGS
 from nerf_lightning.data.readers.frames import FrameFile, say_of_files, views_of
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

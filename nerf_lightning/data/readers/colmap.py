@@ -23,7 +23,7 @@ from nerf_lightning.data.captures.pictures import (
     why_absent,
 )
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.readers.colmap_files import (
     CURE,
     BinaryFiles,

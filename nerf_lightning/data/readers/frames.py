@@ -18,16 +18,16 @@ from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures, why_absent
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import read_header, read_rgba
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import read_header, read_rgba
 from nerf_lightning.data.pixels.plain_background import TOLERANCE
-from nerf_lightning.data.readers.frame_keys import say_of_keys
+from nerf_lightning.data.readers.unknown_keys import say_of_keys
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
-from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
+from nerf_lightning.nerf.geometry.world_frame import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.types.scene import LensModel
 
 LENSES: dict[str, LensModel] = {

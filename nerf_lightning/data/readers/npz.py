@@ -15,8 +15,8 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.captures.scene import Coordinates
 from nerf_lightning.data.captures.splits import in_order
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import PictureHeader
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import PictureHeader
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
 from nerf_lightning.files.numpy_files import open_npz

@@ -29,8 +29,8 @@ from nerf_lightning.data.readers.frames import (
 from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 
 NGP_SCALE = 0.33
 SPLITS = ("train", "val", "test")

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.data.sfm.find_cameras import find_cameras
 from nerf_lightning.data.sfm.panoramas import of_one_kind
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright

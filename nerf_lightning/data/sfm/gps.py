@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import ExifTags
 
-from nerf_lightning.data.pixels.images import DECODER_ERRORS, opened_picture
+from nerf_lightning.data.pixels.picture_files import DECODER_ERRORS, opened_picture
 from nerf_lightning.messages.errors import InputError
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563

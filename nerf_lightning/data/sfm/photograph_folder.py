@@ -10,7 +10,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, UNREAD, decoders
-from nerf_lightning.data.pixels.images import (
+from nerf_lightning.data.pixels.picture_files import (
     DECODER_ERRORS,
     ORIENTATION,
     QUARTER_TURNS,

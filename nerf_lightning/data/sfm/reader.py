@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import identity_of
+from nerf_lightning.data.pixels.decoded_photographs import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.sfm.find_poses import from_photographs, from_video

@@ -17,7 +17,7 @@ from nerf_lightning.export.splats.fitted import SplatFitting
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress, say
-from nerf_lightning.nerf.geometry.frames import directions_to_user, y_up
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, y_up
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes

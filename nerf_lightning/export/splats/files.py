@@ -21,8 +21,8 @@ from nerf_lightning.export.splats.gaussians import TURN, Gaussians
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
-from nerf_lightning.nerf.geometry.frames import points_to_user, unit_of
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
+from nerf_lightning.nerf.geometry.world_frame import points_to_user, unit_of
 
 SplatFormat = Literal["ply", "spz", "glb"]
 FINE = 0.05  # SPZ's places are whole numbers of steps, so large a share of the splats' median size or smaller.

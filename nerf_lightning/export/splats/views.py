@@ -13,7 +13,7 @@ from nerf_lightning.nerf.geometry.lenses import project_plane
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import straight_colors
 

@@ -19,7 +19,7 @@ from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_rays
-from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.rendering.background import background_colors
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import Scene

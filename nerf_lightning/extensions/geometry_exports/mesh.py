@@ -41,7 +41,7 @@ from nerf_lightning.extensions.geometry_exports.texture import (
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user, unit_of
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user, unit_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 

@@ -13,7 +13,7 @@ from PIL import Image
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.errors import InputError, require_extra
-from nerf_lightning.nerf.geometry.frames import y_up
+from nerf_lightning.nerf.geometry.world_frame import y_up
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
 MeshFormat = Literal["ply", "obj", "glb", "stl"]

@@ -21,8 +21,8 @@ from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes

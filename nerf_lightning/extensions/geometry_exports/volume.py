@@ -15,7 +15,7 @@ from nerf_lightning.extensions.geometry_exports.surface import looks_from_neares
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StageProgress
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.points import Points

@@ -19,14 +19,14 @@ from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.signatures import file_with, files_with
 from nerf_lightning.files.xml_files import read_xml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
+from nerf_lightning.nerf.geometry.world_frame import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.types.scene import LensModel
 
 SIGNATURE = ("*.xml", r"\A(?=[\s\S]*?<document)[\s\S]*?<chunk")

@@ -15,8 +15,8 @@ from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order, pictures_below
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import read_header
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import open_npz
 from nerf_lightning.messages.errors import InputError

@@ -8,8 +8,8 @@ from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import read_header
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import read_header
 from nerf_lightning.data.readers.frames import number_of
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import read_json

@@ -17,15 +17,15 @@ from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, first_with_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import read_header
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.signatures import Signature
 from nerf_lightning.files.trust import shown
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import require_printable
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.scene import LensModel
 
 CURE = "Export it again."

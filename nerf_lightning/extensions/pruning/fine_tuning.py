@@ -10,7 +10,7 @@ from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.commands.train import run as train
 from nerf_lightning.config.auto_settings import AUTO, settled
 from nerf_lightning.config.compose import compose_config, composed_job
-from nerf_lightning.config.messages import in_words
+from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.folders import option_names

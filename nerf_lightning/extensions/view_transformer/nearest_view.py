@@ -22,7 +22,7 @@ from nerf_lightning.extensions.view_transformer.view_tables import ViewTables
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.photographs import photographs_of
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
 
 SHARPNESS = 1e-3

@@ -13,7 +13,7 @@ from torch.nn.functional import embedding_bag
 
 from nerf_lightning.extensions.view_transformer.image_network import ImageNetwork
 from nerf_lightning.extensions.view_transformer.projection import seen_cosines
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.photographs import Photographs
 
 KEPT_BYTES = 1 << 28

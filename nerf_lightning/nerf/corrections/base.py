@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.rendering.blending import in_other_light
+from nerf_lightning.nerf.rendering.background import in_other_light
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import SceneRecord

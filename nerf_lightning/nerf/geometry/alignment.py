@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
+from nerf_lightning.nerf.geometry.world_frame import poses_from_user, similarity
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LEAST_SPREAD = 1e-6

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import share_at_distance
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, unit_of
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.frames import middle_of_cameras
+from nerf_lightning.nerf.geometry.world_frame import middle_of_cameras
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, least_agreement, middle_of_cameras
+from nerf_lightning.nerf.geometry.world_frame import FORWARD_FACING, least_agreement, middle_of_cameras
 from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 

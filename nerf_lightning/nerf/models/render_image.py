@@ -19,7 +19,7 @@ from nerf_lightning.nerf.kernels.threads import FEWEST_ROWS, PARTS_PER_THREAD, i
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
-from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.rendering.background import background_colors
 from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Background

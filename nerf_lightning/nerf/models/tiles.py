@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.part import sample_counts
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.rendering.background import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 from nerf_lightning.nerf.types.scene import Background

@@ -150,7 +150,7 @@ class Batch(TensorStruct):
 
     pixels: PixelIndex
     rgba: Float[Tensor, "*rays 4"]
-    """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
+    """Straight alpha; blended with the step's background in one place (`rendering.background`)."""
     weight: Float[Tensor, "*rays"]
     """How much each pixel counts: 0 where it is masked, else 1."""
     distance: Float[Tensor, "*rays"] | None = None

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.key_meanings import meaning_of, names_a_class
+from nerf_lightning.config.setting_rules import meaning_of, names_a_class
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.training.tensorboard import shown_name

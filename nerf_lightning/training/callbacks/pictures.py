@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.nerf.geometry.frames import told_length
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.geometry.world_frame import told_length
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
 from nerf_lightning.training.loggers import show_picture
 from nerf_lightning.visualization.camera_layout import layout_picture

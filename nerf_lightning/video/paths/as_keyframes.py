@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.video.paths.base import CameraPath, PathFrame
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
 from nerf_lightning.video.paths.keyframe_path import KeyframePath

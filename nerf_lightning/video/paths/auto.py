@@ -5,7 +5,7 @@ from typing import final
 
 from torch.nn.functional import normalize
 
-from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, average_pose, least_agreement
+from nerf_lightning.nerf.geometry.world_frame import FORWARD_FACING, average_pose, least_agreement
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting

@@ -17,8 +17,8 @@ from torch.nn.functional import normalize
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
-from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, unit_of
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 

@@ -6,8 +6,8 @@ from typing import final
 
 import torch
 
-from nerf_lightning.nerf.geometry.frames import average_pose
 from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.world_frame import average_pose
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.world_frame import gaps_around
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes

@@ -9,7 +9,7 @@ from support.brick_places import Place, corridor, heap, outward_ring
 
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.examine import examine
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import frame_of

@@ -11,8 +11,8 @@ from support.posed_captures import Known, read, ring, user_rays, wall, write_col
 
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 
 AHEAD = np.array([0.0, 5.0, 0.0])
 PLACES = [(0.0, 0.0), (0.99, 0.0), (0.5, 0.5), (0.2, 0.9)]

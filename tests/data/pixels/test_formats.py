@@ -8,9 +8,9 @@ from PIL import Image, features
 from support.captures import picture
 from support.decoders import without_heic
 
-from nerf_lightning.data.pixels import images
+from nerf_lightning.data.pixels import picture_files
 from nerf_lightning.data.pixels.formats import FORMATS, decoders
-from nerf_lightning.data.pixels.images import image_size, read_header, read_rgba
+from nerf_lightning.data.pixels.picture_files import image_size, read_header, read_rgba
 from nerf_lightning.data.sfm.photograph_folder import find_photographs, put_upright
 from nerf_lightning.messages.errors import InputError
 
@@ -42,7 +42,7 @@ def test_heic_without_its_decoder_names_the_extra_first(tmp_path):
 
 def test_heic_is_read_as_a_phone_shows_it(heif, tmp_path):
     turned = Image.Exif()
-    turned[images.ORIENTATION] = 6
+    turned[picture_files.ORIENTATION] = 6
     PHOTOGRAPH.save(tmp_path / "a.heic", **EXACT)
     PHOTOGRAPH.save(tmp_path / "b.heic", exif=turned.tobytes(), **EXACT)
     assert differences(tmp_path / "a.heic", PHOTOGRAPH) <= 2

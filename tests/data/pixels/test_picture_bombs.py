@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from support.fuzzing import harmless
 
-from nerf_lightning.data.pixels.images import image_size, read_rgba
+from nerf_lightning.data.pixels.picture_files import image_size, read_rgba
 
 MEGABYTE = 1 << 20
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)

@@ -10,12 +10,12 @@ from scipy import ndimage
 from support.captures import write_blender, write_npz
 from support.posed_captures import Known, read, ring, write_transforms
 
-from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
+from nerf_lightning.data.pixels.decoded_photographs import Photograph, read_photographs
 from nerf_lightning.data.pixels.plain_background import cut_out, plain_color
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.nerf.rendering.blending import blend
+from nerf_lightning.nerf.rendering.background import blend
 from nerf_lightning.nerf.types.scene import UNSURE
 
 WIDTH, HEIGHT, VIEWS = 40, 30, 8

@@ -10,7 +10,7 @@ from support.captures import FOV, picture, pose, real_capture, write_blender, wr
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, project
-from nerf_lightning.nerf.geometry.frames import points_to_user
+from nerf_lightning.nerf.geometry.world_frame import points_to_user
 
 COUNTS = {"train": 9, "val": 2, "test": 3}
 

@@ -1,4 +1,4 @@
-"""Blender captures that are refused, with where, what, and the cure; damaged pictures: test_images.py."""
+"""Blender captures that are refused, with where, what, and the cure; damaged pictures: test_picture_files.py."""
 
 import json
 import os

@@ -18,7 +18,7 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.export.cameras import CamerasExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
-from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.video.paths.photograph_path import PhotographPath
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, lay_path, make_shots

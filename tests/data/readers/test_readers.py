@@ -27,7 +27,7 @@ from support.posed_captures import (
 )
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 
 PLACES = [(0.0, 0.0), (0.99, 0.0), (0.5, 0.5), (0.2, 0.9)]
 

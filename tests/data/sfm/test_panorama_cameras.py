@@ -17,8 +17,8 @@ from nerf_lightning.data.sfm.reader import PhotosReader
 from nerf_lightning.data.sfm.settings import SfmSettings
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
-from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+from nerf_lightning.nerf.geometry.world_frame import unit_of
 
 HEIGHT = 192
 WHOLE, NEARLY, PART, PLAIN = (512, 256), (512, 254), (512, 128), (512, 384)

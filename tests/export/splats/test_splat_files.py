@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.export.splats.files import HALF_TURN, moved, save_splats
 from nerf_lightning.export.splats.gaussians import Gaussians, colors, covariances
-from nerf_lightning.nerf.geometry.frames import points_to_user, similarity
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation as quaternions
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion as rotations
+from nerf_lightning.nerf.geometry.world_frame import points_to_user, similarity
 
 MIRRORED = np.array([1.0, -1.0, -1.0])
 

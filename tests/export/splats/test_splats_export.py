@@ -26,8 +26,8 @@ from nerf_lightning.export.splats.fitted import training_views
 from nerf_lightning.export.splats.views import photographed, without_lens
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+from nerf_lightning.nerf.geometry.world_frame import similarity, upright_rotation
 from nerf_lightning.nerf.rendering.linear_light import scale_light, to_linear
 
 TILE = 1 << 15

@@ -8,9 +8,9 @@ from support.scenes import some_rays
 from nerf_lightning.nerf.geometry.boxes import distances_in_box, to_unit_cube
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
-from nerf_lightning.nerf.geometry.frames import points_from_user, similarity
 from nerf_lightning.nerf.geometry.ndc import share_at_distance, world_distance
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, similarity
 
 LOWER, UPPER = (-1.0, 0.5, 2.0), (0.5, 3.0, 2.5)
 

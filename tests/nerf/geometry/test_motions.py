@@ -6,8 +6,8 @@ from support.alignment import umeyama
 from support.scenes import ball_scene
 
 from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
-from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at, rotation_from_vector
+from nerf_lightning.nerf.geometry.world_frame import similarity
 
 
 def a_similarity():

@@ -14,7 +14,7 @@ from nerf_lightning.nerf.models.base import show_photographs
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.part import fit_parts
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep

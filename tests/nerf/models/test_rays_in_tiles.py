@@ -21,7 +21,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.part import fit_parts
-from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.rendering.background import background_colors, photograph
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import PixelStore
 from nerf_lightning.visualization.pictures import panels

@@ -27,7 +27,7 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.objective import Objective
 from nerf_lightning.nerf.part import StepContext, fit_parts
 from nerf_lightning.nerf.randomness import batch_random, fold
-from nerf_lightning.nerf.rendering.blending import blend
+from nerf_lightning.nerf.rendering.background import blend
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.training.step import TrainStep

@@ -7,7 +7,7 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 

@@ -7,8 +7,8 @@ import torch
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.data.pixels.decoded_photographs import Photograph
+from nerf_lightning.data.pixels.picture_files import image_size
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import look_at
 

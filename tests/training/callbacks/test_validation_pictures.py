@@ -7,7 +7,7 @@ import torch
 from support.scenes import ball_scene
 from support.steps import make_step
 
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.training.callbacks import pictures, watcher
 
 

@@ -12,7 +12,7 @@ from support.static_models import fast_model
 
 from nerf_lightning.compute import devices
 from nerf_lightning.compute.devices import working_device
-from nerf_lightning.config.messages import paragraph
+from nerf_lightning.config.error_messages import paragraph
 from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import matmul_precision

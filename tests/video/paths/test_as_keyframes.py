@@ -9,8 +9,8 @@ from support.posed_captures import Known, read, wall, write_llff
 from test_chosen_paths import frame, keyframe_file, keys
 
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
-from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.geometry.world_frame import similarity
 from nerf_lightning.video.paths.as_keyframes import MOST, as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import frame_of

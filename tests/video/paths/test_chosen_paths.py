@@ -8,8 +8,8 @@ import torch
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project
-from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, similarity
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at, rotation_from_quaternion
+from nerf_lightning.nerf.geometry.world_frame import points_from_user, poses_from_user, similarity
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes

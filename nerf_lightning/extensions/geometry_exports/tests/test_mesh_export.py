@@ -20,7 +20,7 @@ from nerf_lightning.extensions.geometry_exports.fused_mesh import depth_rays
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
-from nerf_lightning.nerf.geometry.frames import similarity, unit_of, upright_rotation
+from nerf_lightning.nerf.geometry.world_frame import similarity, unit_of, upright_rotation
 
 RADIUS = 0.8
 TILE = 1 << 15

@@ -22,7 +22,7 @@ from nerf_lightning.extensions.geometry_exports.points import (
     scale_and_offset,
 )
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
+from nerf_lightning.nerf.geometry.world_frame import similarity, upright_rotation
 
 TILE = 1 << 15
 

@@ -15,7 +15,7 @@ from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.extensions.geometry_exports.density_grid import CHUNK
 from nerf_lightning.extensions.geometry_exports.surface import PAIRS, looks_from_facing, looks_from_nearest
 from nerf_lightning.extensions.geometry_exports.volume import BYTES_PER_POINT, VolumeExport
-from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.geometry.world_frame import similarity
 
 CENTER = (0.3, 0.0, -0.2)
 

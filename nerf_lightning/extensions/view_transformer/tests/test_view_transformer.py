@@ -15,7 +15,7 @@ from nerf_lightning.extensions.view_transformer.nearest_view import NearestViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field, show_photographs
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.background import photograph
 
 KINDS = [{}, {"experts": 4}, {"start": "spread", "color": "blended"}, {"image_norm": "neurn"}]
 

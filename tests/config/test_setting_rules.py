@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from support.configs import composed, groups, loaded, options
 
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, ROWS, Trust, meaning_of, names_a_class, row_of
 from nerf_lightning.config.overrides import flatten
+from nerf_lightning.config.setting_rules import CHOSEN_GROUPS, ROWS, Trust, meaning_of, names_a_class, row_of
 from nerf_lightning.files.folders import conf_file, conf_folder
 
 ELSEWHERE = {"sampler": "model.levels.fine.sampler"}

@@ -12,10 +12,10 @@ from PIL import Image
 from support.captures import picture
 from support.running import start_code
 
-from nerf_lightning.data.pixels import decoding as module
+from nerf_lightning.data.pixels import decoded_photographs as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
-from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
-from nerf_lightning.data.pixels.images import PictureHeader, area_downscale, crop_to_multiple, read_rgba
+from nerf_lightning.data.pixels.decoded_photographs import Photograph, read_photographs
+from nerf_lightning.data.pixels.picture_files import PictureHeader, area_downscale, crop_to_multiple, read_rgba
 from nerf_lightning.files import atomic
 from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError
@@ -222,7 +222,7 @@ import sys
 import time
 from pathlib import Path
 
-from nerf_lightning.data.pixels import decoding as module
+from nerf_lightning.data.pixels import decoded_photographs as module
 
 count = 0
 plain = module.read_rgba

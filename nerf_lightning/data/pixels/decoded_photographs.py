@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.data.pixels.images import (
+from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
+from nerf_lightning.data.pixels.picture_files import (
     MaskColor,
     PictureHeader,
     area_downscale,
@@ -24,7 +25,6 @@ from nerf_lightning.data.pixels.images import (
     read_rgba,
     whole_blocks,
 )
-from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixels.placement import num_bytes
 from nerf_lightning.data.pixels.store import each_or_faults, in_threads
 from nerf_lightning.files.folders import default_folder

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from nerf_lightning.nerf.geometry.frames import (
+from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
+from nerf_lightning.nerf.geometry.world_frame import (
     average_pose,
     focus_point,
     points_from_user,
@@ -14,7 +15,6 @@ from nerf_lightning.nerf.geometry.frames import (
     up_direction,
     upright_rotation,
 )
-from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
 
 Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 TARGET = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)

@@ -7,7 +7,7 @@ from support.scenes import ball_scene, some_rays, tiny_field
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.rendering.linear_light import KNEE, scale_light, to_linear
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler

@@ -8,8 +8,8 @@ from PIL import Image
 from support.budget import budget
 from support.captures import picture
 
-from nerf_lightning.data.pixels import images
-from nerf_lightning.data.pixels.images import (
+from nerf_lightning.data.pixels import picture_files
+from nerf_lightning.data.pixels.picture_files import (
     area_downscale,
     crop_to_multiple,
     downscaled_size,
@@ -70,7 +70,7 @@ def test_what_is_shrunk_in_parts_has_the_means_of_the_whole(monkeypatch, alpha):
     rgba = np.random.default_rng(0).integers(0, 256, (21, 12, 4), dtype=np.uint8)
     if alpha != "any":
         rgba[: 21 if alpha == "opaque" else 9, :, 3] = 255
-    monkeypatch.setattr(images, "PIXELS_AT_ONCE", 100)  # two rows of blocks, and then one that is left
+    monkeypatch.setattr(picture_files, "PIXELS_AT_ONCE", 100)  # two rows of blocks, and then one that is left
     assert np.array_equal(area_downscale(rgba, 3), slow_downscale(rgba, 3))
 
 
@@ -240,10 +240,10 @@ def test_of_the_pages_of_a_tiff_the_first_alone_is_read(tmp_path):
 def test_large_pictures_are_decoded_one_at_a_time(tmp_path, monkeypatch):
     Image.new("RGB", (20, 10)).save(tmp_path / "a.png")
     for least, waits in ((199, True), (200, False)):
-        monkeypatch.setattr(images, "LARGE", least)
+        monkeypatch.setattr(picture_files, "LARGE", least)
         read = threading.Event()
-        other = threading.Thread(target=lambda read=read: (images.read_rgba(tmp_path / "a.png"), read.set()))
-        with images.opened_picture(tmp_path / "a.png"):
+        other = threading.Thread(target=lambda read=read: (picture_files.read_rgba(tmp_path / "a.png"), read.set()))
+        with picture_files.opened_picture(tmp_path / "a.png"):
             other.start()
             assert read.wait(timeout=0.3 if waits else 30) is not waits
         other.join()
