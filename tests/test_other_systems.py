@@ -1,12 +1,19 @@
 """Windows and macOS, where nothing was ever run: what the stand-in shows of them."""
 
+import csv
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
-from support.captures import write_npz
-from support.running import FAST, REPOSITORY
+from support import other_systems
+from support.captures import real_capture, write_npz
+from support.command_fixtures import *  # noqa: F403
+from support.ports import unused_port
+from support.running import FAST, REPOSITORY, finished, saved, start_cold
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux stands in for the others")
 SYSTEMS = pytest.mark.parametrize("system", ["win32", "darwin"])
@@ -28,12 +35,22 @@ def test_every_test_is_collected(system):
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
 
 
+def run(system, folder, *commands):
+    """Run commands one after the other in one process."""
+    done = subprocess.run(
+        [sys.executable, "tests/support/other_systems.py"], input="\n".join(commands), text=True, capture_output=True,
+        cwd=REPOSITORY, env=other_systems.environment(system, folder),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-5000:]
+
+
 @SYSTEMS
 @pytest.mark.minutes
 def test_the_main_commands_do_their_work(system, tmp_path):
     """Among them training again over what is there: for Windows, files that are open stay where they are."""
     scene = f"scene=npz scene.path={write_npz(tmp_path / 'capture.npz')}"
-    commands = (
+    run(
+        system, tmp_path,
         f"train {scene} {' '.join(FAST)} paths.output_dir={tmp_path}/run",
         f"train resume={tmp_path}/run trainer.max_steps=6",
         f"eval ckpt={tmp_path}/run paths.output_dir={tmp_path}/eval",
@@ -42,11 +59,54 @@ def test_the_main_commands_do_their_work(system, tmp_path):
         f"doctor {scene} paths.output_dir={tmp_path}/doctor",
         f"table {tmp_path} paths.output_dir={tmp_path}/table",
         f"train -m {scene} {' '.join(FAST)} seed=1,2 final.video=false paths.output_dir={tmp_path}/sweep",
-    )
-    done = subprocess.run(
-        [sys.executable, "tests/support/other_systems.py", system, str(tmp_path)], cwd=REPOSITORY, capture_output=True,
-        input="\n".join(commands), text=True, env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-5000:]
     made = {path.name for path in tmp_path.rglob("*")}
     assert made >= {"last.ckpt", "metrics.json", "video.mp4", "doctor.json", "sweep.csv", "points.ply"}
+
+
+@SYSTEMS
+@pytest.mark.minutes
+@pytest.mark.data
+def test_photographs_without_cameras_become_a_film(system, tmp_path):
+    pytest.importorskip("pycolmap")
+    photographs = f"scene=photos scene.root={real_capture('kermit')} scene.cache_dir={tmp_path}/cache scene.longest=64"
+    run(system, tmp_path, f"train {photographs} {' '.join(FAST)} paths.output_dir={tmp_path}/run")
+    assert (tmp_path / "run" / "video.mp4").stat().st_size > 0
+    assert (tmp_path / "run" / "report.html").stat().st_size > 0
+
+
+@SYSTEMS
+@pytest.mark.minutes
+def test_the_page_shows_pictures_until_ctrl_c(system, finished_run, tmp_path):
+    client = pytest.importorskip("support.viser_client")
+    options = f"port={unused_port()}", f"paths.output_dir={tmp_path}"
+    env = other_systems.environment(system, tmp_path)
+    process = start_cold("nerf_lightning", "view", f"ckpt={finished_run}", *options, env=env)
+    address = next(found[1] for line in process.stdout if (found := re.search(r"The page is at (http://\S+)", line)))
+    client = client.ViserClient(address)
+    client.look_from(0)
+    client.wait_for(len)
+    process.send_signal(signal.SIGINT)
+    code, output = finished(process)
+    assert (code, "Traceback" in output) == (0, False), output
+
+
+@SYSTEMS
+@pytest.mark.minutes
+def test_parallel_jobs_save_when_they_are_stopped(system, capture, tmp_path):
+    """On Windows, the stop file alone tells them: SIGTERM would end them at once."""
+    env = other_systems.environment(system, tmp_path)
+    jobs = (*FAST, "hydra/launcher=parallel", "seed=0,1,2", "final.video=false", f"paths.output_dir={tmp_path}/sweep")
+    words = ("train", "-m", "scene=npz", f"scene.path={capture}", *jobs, "trainer.max_steps=100000")
+    process = start_cold("nerf_lightning", *words, env=env, start_new_session=True)
+    while process.poll() is None and len(list(tmp_path.glob("sweep/*/checkpoints/last.ckpt"))) < 2:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    code, output = finished(process)
+    assert code == 130, output
+    rows = list(csv.DictReader((tmp_path / "sweep" / "sweep.csv").read_text().splitlines()))
+    assert [row["state"] for row in rows] == ["stopped", "stopped"], output
+    assert output.count("stopped at step") == 2
+    for folder in (tmp_path / "sweep").glob("[01]_*"):
+        assert f"stopped at step {saved(folder)['global_step']}" in output
+    assert not (tmp_path / "sweep" / "2_seed=2" / "run.json").exists()

@@ -82,17 +82,16 @@ def _view(arguments: list[str]) -> list[str]:
 
 def _export(arguments: list[str]) -> list[str]:
     """Name the run's own scene as for `eval` where the exporter needs photographs; where it is unknown, do without."""
-    named = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
-    if not named:
-        return arguments
+    typed = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
+    name = typed[-1] if typed else "page"  # as in conf/export.yaml
     with quick_imports():
         from nerf_lightning.config.exporters import exporter_class
 
-        exporter = exporter_class(named[-1])
+        exporter = exporter_class(name)
     # Nothing is known here of an exporter of a person's own: it may need them.
     if exporter is not None and not getattr(exporter, "needs_photographs", False):
         return arguments
-    return _eval_or_without(arguments, ["photographs=false"], f"what={named[-1]} does not use photographs")
+    return _eval_or_without(arguments, ["photographs=false"], f"what={name} does not use photographs")
 
 
 def _eval_or_without(arguments: list[str], without: list[str], said: str) -> list[str]:

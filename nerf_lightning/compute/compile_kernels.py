@@ -25,7 +25,7 @@ def compile_kernels(modules: Sequence[str]) -> None:
 def _compile(modules: Sequence[str]) -> None:
     if not modules:
         return
-    log.info("compiling %d modules of kernels for this CPU, once", len(modules))
+    log.info("compiling kernels for this CPU, once")
     with progress_bar("{task.description}", BarColumn(), TimeElapsedColumn()) as bar:
         task, left = bar.add_task(f"compiling kernels: {len(modules)} left", total=len(modules)), len(modules)
         for _ in compile_ahead(modules, num_cores()):

@@ -15,6 +15,8 @@ from nerf_lightning.messages.escaping import for_terminal
 DAY = 86_400
 LINE_SECONDS = 30.0
 """Time between two lines that say how far something is, where no bar can be shown."""
+FORESEEN_FROM = 0.05
+"""The part that is done when those lines begin to say how long is left: until then, compiling kernels may dominate."""
 
 Item = TypeVar("Item")
 log = logging.getLogger(__name__)
@@ -47,8 +49,8 @@ class ProgressLines:
         if not self.shown or now - self.told < LINE_SECONDS or not 0 < fraction < 1:
             return
         self.told = now
-        left = (now - self.began) * (1 - fraction) / fraction
-        log.info("%s: %.0f %%, about %s left", what, 100 * fraction, spoken(left))
+        left = f", about {spoken((now - self.began) * (1 - fraction) / fraction)} left"
+        log.info("%s: %.0f %%%s", what, 100 * fraction, left if fraction >= FORESEEN_FROM else "")
 
 
 def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:

@@ -107,7 +107,7 @@ def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
         given = [result.summary.overrides for result in (one, other)]
         chosen = [{key: value for key, value in each.items() if _chooses_pictures(key)} for each in given]
         differing = [
-            " and ".join(f"{key}={each[key]}" if key in each else "its default" for each in chosen)
+            " and ".join(f"{key}={each[key]}" if key in each else f"{key} not set" for each in chosen)
             for key in differing_keys(chosen)
         ]
         cause = "although the settings are the same: the capture has changed"

@@ -83,7 +83,7 @@ def test_a_page_goes_without_photographs_and_says_so_unless_they_were_wished_for
     with pytest.raises(UnknownScene):
         prepare._view(["ckpt=a", "photographs=True"])
     assert prepare._export(["ckpt=a", "what=cameras"]) == ["ckpt=a", "what=cameras"]
-    assert prepare._export(["ckpt=a"]) == ["ckpt=a"]
+    assert prepare._export(["ckpt=a"]) == ["photographs=false", "ckpt=a"]
     assert prepare._export(["ckpt=a", "what=my_own"])[0] == "photographs=false"
 
 

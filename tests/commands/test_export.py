@@ -34,9 +34,7 @@ def test_images_are_written_where_it_is_said(nerf, last, tmp_path):
 
 def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, finished_run, tmp_path):
     where = f"paths.output_dir={tmp_path}"
-    result = nerf(
-        "export", f"ckpt={last}", "what=page", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2", where
-    )
+    result = nerf("export", f"ckpt={last}", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2", where)
     if result.code:  # 20 steps may leave a field without anything in it
         said(result, "There is no surface to put splats on")
         return

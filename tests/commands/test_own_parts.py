@@ -41,6 +41,7 @@ def own_run(nerf, capture, tmp_path):
 def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(nerf, own_run, tmp_path):
     run, output = own_run
     assert f"commands that open its checkpoints need trust={MODULE}" in " ".join(output.split())
+    assert f"view ckpt={run} trust={MODULE}\n" in output
     said(nerf("eval", f"ckpt={run}"), "VoxelModel", f"If it is your own, add trust={MODULE};")
     where = f"paths.output_dir={tmp_path}/out"
     measured = nerf("eval", f"ckpt={run}", f"trust={MODULE}", "evaluation.max_views=1", where)

@@ -139,7 +139,7 @@ def test_other_pictures_are_told_by_the_settings_that_chose_them(table, tmp_path
     said(result, "runs/a", "runs/b", "(different views: scene.num_test=8 and scene.num_test=16)")
     assert "split_hash" not in result.err
     text = table("force=true")[0].out
-    assert "different views: scene.num_test=8 and its default" in text
+    assert "different views: scene.num_test=8 and scene.num_test not set" in text
     assert "split_hash" not in text
 
 

@@ -146,6 +146,13 @@ def test_items_that_take_long_are_told_in_lines(told):
     assert told() == ["filming: 20 %, about 2 min 40 s left", "filming: 60 %, about 53 s left"]
 
 
+def test_the_time_left_is_not_told_of_what_has_only_begun(told):
+    lines = console.ProgressLines()
+    for fraction in (0.02, 0.02, 0.05, 0.05):
+        lines("surfaces", fraction)
+    assert told() == ["surfaces: 2 %", "surfaces: 5 %, about 25 min 20 s left"]
+
+
 def test_stages_are_told_in_lines_with_the_share_of_the_whole(told):
     with console.StageProgress({"matching": 3.0, "reconstruction": 1.0}) as report:
         for stage, fraction in (("matching", 0.0), ("matching", 0.5), ("reconstruction", 0.0), ("reconstruction", 1.0)):

@@ -29,6 +29,15 @@ POSIX_ONLY = (
 )
 WINDOWS_SIGNALS = ("SIGABRT", "SIGFPE", "SIGILL", "SIGINT", "SIGSEGV", "SIGTERM", "SIG_DFL", "SIG_IGN")
 OF_SIGNALS = ("SIG", "ITIMER", "alarm", "setitimer", "getitimer", "pause", "pthread", "sigwait", "sigpending")
+# What Python runs by itself when it begins.
+BEGIN = """
+from pathlib import Path
+from support import other_systems
+
+other_systems.install({system!r})
+if {system!r} == "win32":
+    other_systems.hold_open_files(Path({below!r}))
+"""
 # What imports of a module find instead: attributes that are missing (None), or others.
 Differences = dict[str, dict[str, Any] | None]
 
@@ -56,7 +65,9 @@ def differences(system: str) -> Differences:
 
     others = (name for name in dir(signal) if name.startswith(OF_SIGNALS) and name not in WINDOWS_SIGNALS)
     return {
-        "os": {"name": "nt", "O_BINARY": 0} | _missing(*LINUX_ONLY, *POSIX_ONLY),
+        # Whatever signal it sends ends a process at once.
+        "os": {"name": "nt", "O_BINARY": 0, "kill": lambda pid, _: os.kill(pid, signal.SIGKILL)}
+        | _missing(*LINUX_ONLY, *POSIX_ONLY),
         "sys": {"platform": system},
         "signal": _missing(*others),
         "mmap": _missing(*(name for name in dir(mmap) if name.startswith(("MAP_", "PROT_", "MADV_")))),
@@ -124,10 +135,15 @@ def hold_open_files(below: Path) -> None:
         setattr(os, name, holding(getattr(os, name)))
 
 
+def environment(system: str, below: Path) -> dict[str, str]:
+    """Return the environment in which Python, and whatever it starts, begins on another system."""
+    places = (str(below / "begin"), str(REPOSITORY), str(REPOSITORY / "tests"))
+    (below / "begin").mkdir(exist_ok=True)
+    (below / "begin" / "sitecustomize.py").write_text(BEGIN.format(system=system, below=str(below)))
+    return os.environ | {"PYTHONPATH": os.pathsep.join(places)}
+
+
 if __name__ == "__main__":
-    install(sys.argv[1])
-    if sys.argv[1] == "win32":
-        hold_open_files(Path(sys.argv[2]))
     from nerf_lightning.cli.main import main
 
     for line in sys.stdin:

@@ -146,12 +146,15 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
     )
     if folder.former is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")
+    trust = trust_setting(job)
+    if trust:
+        log.info("the model has parts of your own: commands that open its checkpoints need %s", trust)
+
+
+def trust_setting(job: TrainJob) -> str:
+    """Return what a command that opens the run's checkpoints needs to build its model, empty if nothing."""
     own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
-    if own:
-        log.info(
-            "the model has parts of your own: commands that open its checkpoints need trust=%s",
-            own[0] if len(own) == 1 else f"[{','.join(own)}]",
-        )
+    return f"trust={own[0] if len(own) == 1 else '[' + ','.join(own) + ']'}" if own else ""
 
 
 def resume_command(folder: Path) -> str:

@@ -16,7 +16,7 @@ from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
-from nerf_lightning.commands.train_job.fit import resume_command
+from nerf_lightning.commands.train_job.fit import resume_command, trust_setting
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.instantiate import build
@@ -65,7 +65,7 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         examine = None if checks is None else lambda: checks
         write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
         say(_result(job, target, psnr, trainer.global_step))
-    say(f"look at it   {_program()} view {to_type('ckpt', str(folder))}")
+    say(f"look at it   {_program()} view {to_type('ckpt', str(folder))} {trust_setting(job)}".rstrip())
 
 
 def _program() -> str:
