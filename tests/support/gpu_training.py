@@ -12,7 +12,6 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.matmul_precision import set_precision
-from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
@@ -61,9 +60,6 @@ def step_by_step(
     scene, progress = many_views(24) if looks else ball_scene(), Progress()
     training = build_step(config, settings, scene, progress).to(device)
     training.num_steps = 1000
-    for level in training.model.modules():
-        if isinstance(level, RaggedLevel):
-            level.sampler.opaque_below = 0.0  # GPUs cut off no samples, and the losses are compared
     set_precision(training.model, PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
     return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))

@@ -29,7 +29,7 @@ SMALL = {
     "random.cuda": ["_uniform"],
     "march.cuda": ["_enter", "_march", "_write"],
     "spherical_harmonics.cuda": ["_harmonics"],
-    "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible"],
+    "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible", "_first"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
     "histograms.cuda": ["_sample", "_stratified", "_interlevel", "_distortion"],
     "adam.cuda": ["_update"],
