@@ -115,6 +115,7 @@ def counted(model: str, data: Any, share: float) -> dict[str, int]:
         run = step_by_step(model, there.device, "bf16-mixed", None, *changes)
         for _ in range(3):
             launches.counts.clear()
+            run.training.progress.batch_rays = int(data.batch_rays * share)  # a first step's samples are not known yet
             run.step()
         learnt = [each for group in run.optimizer.param_groups for each in group["params"]]
         if isinstance(run.optimizer, TableAdam):  # its kernel is given addresses: of weights, gradients and moments

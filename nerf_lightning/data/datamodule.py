@@ -31,9 +31,9 @@ class RayDataModule(LightningDataModule):
         progress: the run's place, shared with the system.
         seed: the run's seed.
         batch_rays: rays per training step (the batch size); with a budget, the maximum.
-        sample_budget: the target number of samples per step, to which the number of rays adapts in a few fixed sizes;
-            None: a fixed number of rays. As empty space is skipped, steps then take equally long and see more rays;
-            larger budgets make them steadier and slower. Needs a model that skips empty space.
+        sample_budget: the target number of visible samples per step, to which the number of rays adapts in a few fixed
+            sizes; None: a fixed number of rays. As empty space is skipped, steps then take equally long and see more
+            rays; larger budgets make them steadier and slower. Needs a model that skips empty space.
         crop_steps: initial steps that see only the centers of the images.
         crop_fraction: share of each side that the crop keeps.
         restart_crop_steps: the minimum of crop_steps after a restart by the collapse guard.

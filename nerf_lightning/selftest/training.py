@@ -24,8 +24,8 @@ ENCODER = (
     *("encoder.num_levels=4", "encoder.features_per_level=4", "encoder.log2_table_size=11"),
     *("encoder.min_resolution=4", "encoder.max_resolution=48", "field.width=32"),
 )
-# GPUs train samples that lie behind opaque matter, and CPUs leave them out. However little of them can be seen, Adam
-# scales their gradients up to whole steps: a cut at 1e-6 changes the PSNR by 0.45 dB.
+# All samples: where the light is all but gone, rounding decides whether the last one is visible, and however little of
+# it can be seen, Adam scales its gradients up to whole steps (fast_small in bfloat16: 0.36 dB apart instead of 0.005).
 GRID = tuple(
     f"model.levels.fine.sampler.{each}"
     for each in ("resolution=16", "num_steps=48", "update_every=8", "warmup_steps=16", "opaque_below=0.0")

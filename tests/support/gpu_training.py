@@ -12,7 +12,6 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.matmul_precision import set_precision
-from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
@@ -62,9 +61,6 @@ def step_by_step(
     training = build_step(config, settings, scene, progress)
     training.objective.to(device)
     training.num_steps = 1000
-    for level in training.objective.model.modules():
-        if isinstance(level, RaggedLevel):
-            level.sampler.opaque_below = 0.0  # GPUs cut off no samples, and the losses are compared
     set_precision(training.objective.model, PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
     return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))

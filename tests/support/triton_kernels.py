@@ -16,7 +16,7 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam.op import adam_step_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.reference import march_torch
-from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
+from nerf_lightning.nerf.kernels.ragged.reference import first_of_each_ray_torch, integrate_torch, transmittance_torch
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
 from nerf_lightning.nerf.randomness import batch_random, purpose_word
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
@@ -156,6 +156,27 @@ def check_ragged(kernels, device, generator, rays):
     light[total:] = False
     seen = torch.zeros_like(samples.bounds[1:]).index_add(0, samples.ray_index, light.long())
     assert torch.equal(kernels.num_visible(density, samples, 1e-3), seen)
+    check_first_of_each_ray(kernels, samples, seen, rgb)
+
+
+def check_first_of_each_ray(kernels, samples, seen, features):
+    """Bit for bit: with room, full, exceeded by one and by most, and of no rays."""
+    visible = int(seen.sum())
+    for capacity in (visible + 40, visible, visible - 1, 3, 0):
+        for given in (features, None):
+            found = kernels.first_of_each_ray(samples, seen, given, capacity)
+            assert_same_samples(found, first_of_each_ray_torch(samples, seen, given, capacity))
+    none = RaggedSamples(seen[:0], features[:0, 0], features[:0, 0], 0 * samples.bounds[:1], samples.found, 90)
+    found = kernels.first_of_each_ray(none, seen[:0], features[:0], 0)
+    assert_same_samples(found, first_of_each_ray_torch(none, seen[:0], features[:0], 0))
+
+
+def assert_same_samples(found, expected):
+    for one, other in zip(found[0].tensors(), expected[0].tensors(), strict=True):
+        assert torch.equal(one, other)
+    assert found[0].longest == expected[0].longest
+    assert (found[1] is None) == (expected[1] is None)
+    assert found[1] is None or torch.equal(found[1], expected[1])
 
 
 def check_histograms(kernels, device, generator, rays):
@@ -226,7 +247,13 @@ def check_render(kernels, device, generator, rays):
             parts = field.parts()
             parts = parts if colored else replace(parts, color_weights=[])
             with forced():
-                found = kernels.render(bundle, samples, parts, "float32", True, whole_from)
+                features = None
+                if isinstance(samples, RaggedSamples):
+                    density, features = kernels.density(bundle, samples, parts, "float32")
+                    used = int(samples.found)
+                    exact = field.density(ragged_points(bundle, samples, None))[0]
+                    torch.testing.assert_close(density[:used], exact[:used].detach(), rtol=1e-4, atol=1e-5)
+                found = kernels.render(bundle, samples, parts, "float32", True, whole_from, features)
             grads = [torch.randn(each.shape, generator=generator).to(device) for each in found]
             torch.autograd.backward(found, grads)
             gradients = [parameter.grad.clone() for parameter in field.parameters() if parameter.grad is not None]

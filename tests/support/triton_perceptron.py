@@ -41,5 +41,23 @@ def check_perceptron(device, counts):
                 assert torch.equal(found, leaf.grad), (sizes, count, found.shape)
             assert torch.equal(backend.forward(points, weights, keep=False)[0], out)
             assert backend.backward(grad, weights, kept, wants_points=False)[0] is None
+            for padding in (0, 1, 150, 640):
+                check_padding(backend, points, grad, weights, max(0, count - padding))
     assert not backend.takes((32, 3), torch.device(device))
     assert not backend.takes((32, 256, 3), torch.device(device))
+
+
+def check_padding(backend, points, grad, weights, rows):
+    """Rows after the first ones, of zeros, are left out, whatever memory holds where nothing is computed."""
+    used = torch.full((1,), rows, device=points.device)
+    points, grad = (each.clone() for each in (points, grad))
+    points[rows:], grad[rows:] = 0.0, 0.0
+    out, kept = backend.forward(points, weights, True, used)
+    expected, all_kept = backend.forward(points, weights, keep=True)
+    assert torch.equal(out, expected)
+    computed = -(-rows // backend.BLOCK) * backend.BLOCK
+    kept[computed:] = torch.nan
+    found = backend.backward(grad, weights, kept, True, used)
+    expected = backend.backward(grad, weights, all_kept, True)
+    assert torch.equal(found[0], expected[0])
+    assert all(map(torch.equal, found[1], expected[1]))

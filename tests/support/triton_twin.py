@@ -24,5 +24,14 @@ def check_against_the_reference(device: str, count: int) -> None:
         backend.add_table_gradient(gradient, points, grad, layout)
         assert float((found - expected.detach()).norm() / expected.detach().norm()) < 1e-5
         assert float((gradient - leaf.grad).norm() / leaf.grad.norm()) < 1e-5
+        for rows in (0, 1, count - 1, count):
+            used, cut = torch.full((1,), rows, device=device), grad.clone()
+            cut[rows:] = 0.0
+            some, of_some, of_cut = backend.forward(table, points, layout, used), gradient * 0.0, gradient * 0.0
+            assert torch.equal(some[:rows], found[:rows])
+            assert not some[-(-rows // backend.BLOCK) * backend.BLOCK :].any()
+            backend.add_table_gradient(of_some, points, cut, layout, used)
+            backend.add_table_gradient(of_cut, points, cut, layout)
+            assert torch.equal(of_some, of_cut) or str(device) != "cpu"  # a GPU adds in any order
         half = backend.forward(table.half(), points, layout)
         assert 1e-6 < float((half - expected.detach()).norm() / expected.detach().norm()) < 2e-3

@@ -163,3 +163,10 @@ def test_arrays_of_samples_hold_twice_what_a_step_is_made_to_have(model):
         assert sampler.capacity_for(many) == (1 << 20 if budget is None else 2 * budget)
         # No more than there are intervals, where those are fewer.
         assert sampler.capacity_for(few) == 8 * (sampler.lattice.numel() - 2)
+        # Those of all samples in occupied cells, visible or not, are four times as large.
+        with torch.no_grad():
+            assert len(sampler(few, None).starts) == sampler.capacity_for(few)
+            sampler.capacity = 10
+            assert len(sampler(few, None).starts) == 4 * sampler.capacity_for(few) == 40
+            sampler.opaque_below = 0.0
+            assert len(sampler(few, None).starts) == 10

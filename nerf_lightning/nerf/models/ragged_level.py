@@ -67,10 +67,8 @@ class RaggedLevel(Level):
             seen = self._all_samples_of(rays, background) if rays.near.is_cuda else None
             return render_until_opaque(self.sampler, self.field, rays, background) if seen is None else seen
         samples, features = visible_samples(self.sampler, self.field, rays, random)
-        capacity, found = self.sampler.capacity_for(rays), samples.found
-        dropped = torch.zeros_like(found) if capacity is None else (found - capacity).clamp(min=0)
-        self.counter.add(found, rays.near.shape[0], dropped)
-        fused = self._fused(rays, samples, background) if rays.near.is_cuda else None
+        self.counter.add(samples.found, rays.near.shape[0], samples.found - samples.bounds[-1])
+        fused = self._fused(rays, samples, background, features) if rays.near.is_cuda else None
         if fused is not None:
             return fused
         output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
@@ -88,10 +86,15 @@ class RaggedLevel(Level):
         return self._fused(rays, samples, background) if samples.starts.numel() <= MOST_SAMPLES else None
 
     def _fused(
-        self, rays: RayBundle, samples: RaggedSamples, background: Float[Tensor, "rays 3"] | None
+        self,
+        rays: RayBundle,
+        samples: RaggedSamples,
+        background: Float[Tensor, "rays 3"] | None,
+        features: Float[Tensor, "capacity features"] | None = None,
     ) -> Rendering | None:
         """Render samples with the kernels for CUDA; None where they do not do all that is asked for."""
-        integrated = render_samples(rays, samples, self.field.parts(), self.field.matmul_precision)
+        parts, precision = self.field.parts(), self.field.matmul_precision
+        integrated = render_samples(rays, samples, parts, precision, features=features)
         if integrated is None:
             return None
         *sums, weights = integrated

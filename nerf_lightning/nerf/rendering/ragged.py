@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.ragged.op import integrate
@@ -35,9 +34,3 @@ def sum_over_rays(values: Float[Tensor, "capacity n"], samples: RaggedSamples) -
     """Return the sum of each ray's values."""
     total = values.new_zeros(samples.bounds.shape[0] - 1, values.shape[1])
     return total.index_add(0, samples.ray_index, values)
-
-
-def first_of_each_ray(samples: RaggedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
-    """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
-    kept = (samples.sample_index < counts.index_select(0, samples.ray_index)).nonzero()[:, 0]
-    return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

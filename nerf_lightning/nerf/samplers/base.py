@@ -87,7 +87,10 @@ class RaggedSampler(Sampler, ABC):
         """Return the intervals that may hold something; `random` is None outside of training."""
 
     def capacity_for(self, rays: RayBundle) -> int | None:
-        """Return the size of the arrays of samples where no size may be read on the host; None elsewhere."""
+        """Return the size of the arrays of visible samples where no size may be read on the host; None elsewhere.
+
+        The arrays that `forward` returns may be larger.
+        """
         return None
 
     def grid_march(self, rays: RayBundle, random: RayRandom | None) -> GridMarch | None:

@@ -1,13 +1,14 @@
-"""Early termination: sample rays in chunks until little light is left; most hidden samples are never computed."""
+"""Early termination: what lies behind opaque samples is neither counted nor given a color."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.ragged.op import num_visible
+from nerf_lightning.nerf.kernels.ragged.op import first_of_each_ray, num_visible
+from nerf_lightning.nerf.kernels.render.op import sample_density
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged, first_of_each_ray
+from nerf_lightning.nerf.rendering.ragged import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
@@ -24,15 +25,19 @@ def visible_samples(
 ) -> tuple[RaggedSamples, Float[Tensor, "capacity features"] | None]:
     """Return the samples of each ray up to where it is opaque, and the features that were computed to see that.
 
-    Without gradients. Where sizes may not be read on the host, all samples are kept.
+    Without gradients. `found` counts what is returned, and what there was no room for. Where sizes may be read on the
+    host, most hidden samples are never computed; elsewhere (CUDA graphs) the density of all is.
     """
-    samples = sampler(rays, random)
-    if sampler.capacity_for(rays) is not None or sampler.opaque_below == 0:
+    samples, capacity = sampler(rays, random), sampler.capacity_for(rays)
+    if sampler.opaque_below == 0:
         return samples, None
     with torch.no_grad():
-        counts, features = _until_opaque(sampler, field, rays, samples, random)
-        kept = first_of_each_ray(samples, counts)
-        return samples.at(*kept), None if features is None else features.index_select(0, kept[0])
+        if capacity is None:
+            counts, features = _until_opaque(sampler, field, rays, samples, random)
+        else:
+            density, features = _density(field, rays, samples, random)
+            counts = num_visible(density, samples, sampler.opaque_below)
+        return first_of_each_ray(samples, counts, features, capacity)
 
 
 def render_until_opaque(
@@ -59,6 +64,16 @@ def render_until_opaque(
     return Rendering.from_light(rays, background, rgb, light, depth, channels)
 
 
+def _density(
+    field: Field, rays: RayBundle, samples: RaggedSamples, random: RayRandom | None, first: int = 0
+) -> tuple[Float[Tensor, "capacity"], Float[Tensor, "capacity features"] | None]:
+    found = sample_density(rays, samples, field.parts(), field.matmul_precision) if rays.near.is_cuda else None
+    if found is not None:
+        return found
+    density, features = field.density(ragged_points(rays, samples, random, field.sees_cones, first))
+    return density.float(), features
+
+
 def _until_opaque(
     sampler: RaggedSampler, field: Field, rays: RayBundle, samples: RaggedSamples, random: RayRandom | None
 ) -> tuple[Tensor, Tensor | None]:
@@ -71,8 +86,7 @@ def _until_opaque(
         until_there = counts.clamp(max=until).index_select(0, samples.ray_index)
         number = ((sample_index >= asked) & (sample_index < until_there)).nonzero()[:, 0]
         part = samples.at(number, torch.cat([counts.new_zeros(1), in_chunk.cumsum(0)]))
-        found, computed = field.density(ragged_points(rays, part, random, field.sees_cones, first=asked))
-        density[number] = found.float()
+        density[number], computed = _density(field, rays, part, random, first=asked)
         if computed is not None:
             features = computed.new_empty(*sample_index.shape, computed.shape[1]) if features is None else features
             features[number] = computed

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from itertools import pairwise
 
 import pytest
 import torch
@@ -29,7 +30,7 @@ SMALL = {
     "random.cuda": ["_uniform"],
     "march.cuda": ["_enter", "_march", "_write"],
     "spherical_harmonics.cuda": ["_harmonics"],
-    "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible"],
+    "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible", "_first"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
     "histograms.cuda": ["_sample", "_stratified", "_interlevel", "_distortion"],
     "adam.cuda": ["_update"],
@@ -40,6 +41,8 @@ SMALL = {
 BFLOAT16 = [name for name in DEVICES if name != "sm_75"]  # where float32 is used instead
 # The one that the kernels of the default model did not fit into is always tried.
 FOR_ALL = [pytest.param(name, marks=[] if name == "sm_89" else pytest.mark.minutes) for name in DEVICES]
+USED = torch.ones(1, dtype=torch.int64)
+"""Where padding begins, as kernels get it of rays with different numbers of samples."""
 MOST_SPILLED = 152
 """Bytes of a thread that no register had room for, of the kernels below, on sm_120: a change must not add to it."""
 
@@ -75,16 +78,20 @@ def test_the_kernels_of_every_model_fit(name, reachable):
     for layout, features in grids.items():
         points, out = torch.zeros(128, 3), torch.zeros(128, len(layout.resolutions) * features)
         with compiled_for(name, KERNELS) as made:
-            hash_grid.forward(torch.empty(layout.offsets[-1], features), points, layout)
-            hash_grid.add_table_gradient(torch.empty(layout.offsets[-1], features), points, out, layout)
-        assert len(made.kernels) == 2
+            for used in (None, USED):
+                hash_grid.forward(torch.empty(layout.offsets[-1], features), points, layout, used)
+                hash_grid.add_table_gradient(torch.empty(layout.offsets[-1], features), points, out, layout, used)
+        assert len(made.kernels) == 4
         assert made.spilled() == 0
         # A stricter atomic addition is a fence, and empties the first-level cache.
         assert not any("acq_rel" in kernel.asm.get("ptx", "") for kernel in made.kernels)
     for widths in sizes if name in BFLOAT16 else ():
         with compiled_for(name, KERNELS) as made:
             assert mlp.takes(widths, torch.device("cpu")), widths
-        assert len(made.kernels) == 2
+            weights = [torch.empty(outer, inner) for inner, outer in pairwise(widths)]
+            out, kept = mlp.forward(torch.empty(128, widths[0]), weights, True, USED)
+            mlp.backward(out, weights, kept, True, USED)
+        assert len(made.kernels) == 4
         assert made.spilled() <= MOST_SPILLED, widths
 
 

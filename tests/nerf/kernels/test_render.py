@@ -145,8 +145,8 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     assert gradients.keys() == of_single.keys()
     for name, gradient in gradients.items():
         assert far_apart(gradient, of_single[name]) < 5 * most, name
-    # What lies behind an opaque sample is not asked about.
-    assert asked == int(level.counter.counts[0]) if opaque_below == 0.0 else asked < int(level.counter.counts[0])
+    # Both count visible samples alone; the light before one may be the least that is seen, to the last bit.
+    assert asked == pytest.approx(int(level.counter.counts[0]), rel=0.0 if opaque_below == 0.0 else 2e-3)
 
 
 def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):

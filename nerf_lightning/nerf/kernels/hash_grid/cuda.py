@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+from nerf_lightning.nerf.kernels.padding import end_of_rows
 
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
@@ -21,9 +22,12 @@ BLOCK = 128
 
 
 def forward(
-    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    layout: "HashGridLayout",
+    used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
-    """Return the features."""
+    """Return the features; zeros from point `used` on, up to a block."""
     levels, features = len(layout.resolutions), table.shape[1]
     out = torch.empty(points.shape[0], levels * features, device=points.device)
     if points.shape[0]:
@@ -31,6 +35,7 @@ def forward(
         where = (
             *_levels(layout, points.device),
             out,
+            used,
             points.shape[0],
             levels,
             features,
@@ -46,14 +51,16 @@ def add_table_gradient(
     points: Float[Tensor, "points 3"],
     grad: Float[Tensor, "points out"],
     layout: "HashGridLayout",
+    used: Int[Tensor, "1"] | None = None,
 ) -> None:
-    """Add the gradient with respect to the table to `into`."""
+    """Add the gradient with respect to the table to `into`; nothing flows back from point `used` on."""
     levels, features = len(layout.resolutions), into.shape[1]
     if points.shape[0]:
         grid = (triton.cdiv(points.shape[0], BLOCK), levels)
         where = (
             *_levels(layout, points.device),
             grad,
+            used,
             points.shape[0],
             levels,
             features,
@@ -83,8 +90,10 @@ def trial(device: str = "cuda") -> None:
 
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
     table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)
-    forward(table, points, layout)
-    add_table_gradient(table, points, grad, layout)
+    used = torch.full((1,), 3, device=device)
+    for count in (None, used):
+        forward(table, points, layout, count)
+        add_table_gradient(table, points, grad, layout, count)
     if not bool(table.isfinite().all()):  # read, so that a fault in the kernels shows here
         raise RuntimeError("a trial of its kernels gave numbers that are not finite")
 
@@ -159,6 +168,7 @@ def _forward(
     hashed_levels,
     mask,
     out,
+    used,
     count,
     levels: tl.constexpr,
     features: tl.constexpr,
@@ -168,13 +178,16 @@ def _forward(
     row, valid, feature, level, resolution, offset, hashed = _level_of(
         resolutions, offsets, hashed_levels, count, width, block
     )
+    there, at = valid & (feature < features), out + row * (levels * features) + level * features + feature
+    if tl.program_id(0) * block >= end_of_rows(used, count):
+        tl.store(at, tl.zeros([block, width], tl.float32), mask=there)
+        return
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
-    there = valid & (feature < features)
     total = tl.zeros([block, width], tl.float32)
     for corner in tl.static_range(8):
         entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
         total += weight * tl.load(table + entry * features + feature, mask=there, other=0.0).to(tl.float32)
-    tl.store(out + row * (levels * features) + level * features + feature, total, mask=there)
+    tl.store(at, total, mask=there)
 
 
 @triton.jit
@@ -187,6 +200,7 @@ def _backward(
     hashed_levels,
     mask,
     grad,
+    used,
     count,
     levels: tl.constexpr,
     features: tl.constexpr,
@@ -196,6 +210,8 @@ def _backward(
     row, valid, feature, level, resolution, offset, hashed = _level_of(
         resolutions, offsets, hashed_levels, count, width, block
     )
+    if tl.program_id(0) * block >= end_of_rows(used, count):
+        return
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
     at = grad + row * (levels * features) + level * features + feature
     flowing = tl.load(at, mask=valid & (feature < features), other=0.0)

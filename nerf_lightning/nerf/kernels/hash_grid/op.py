@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
@@ -59,6 +59,7 @@ def interpolate(
     points: Float[Tensor, "points 3"],
     layout: HashGridLayout,
     known: Float[Tensor, "points out"] | None = None,
+    used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level; points outside are moved to its face.
 
@@ -69,11 +70,13 @@ def interpolate(
         points: in the unit cube.
         layout: where the levels' entries lie.
         known: what this function returned for the same arguments without gradients: it is not computed again.
+        used: on CUDA, the point from which on all is padding: kernels do not compute it, and no gradient comes from it.
     """
     backend = cpu_backend("hash_grid.cpu", points.device) or cuda_backend("hash_grid.cuda", points.device)
     if backend is None or table.dtype == torch.float64:
         return interpolate_torch(table, points, layout)
-    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, known)
+    padding = (used,) if used is not None and points.is_cuda else ()
+    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, known, padding)
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def table_gradient(
     grad: Float[Tensor, "points out"],
     layout: HashGridLayout,
     kernels: ModuleType,
+    padding: tuple[Tensor, ...] = (),
 ) -> Float[Tensor, "entries features"] | None:
     """Return a table's gradient in a backward pass; None where it is held back, or was added in place.
 
@@ -113,6 +117,7 @@ def table_gradient(
         grad: of their features.
         layout: where the levels' entries lie.
         kernels: with `add_table_gradient`.
+        padding: on CUDA, where padding begins (`interpolate`).
     """
     if _held.gradients is not None:
         _held.gradients.append(TableGradient(table, points, grad, layout, kernels))
@@ -121,7 +126,7 @@ def table_gradient(
     # zeros for each tile costs more than the gradients themselves.
     kept = table.grad if getattr(table, "grad_in_place", False) else None
     into = torch.zeros_like(table, dtype=torch.float32) if kept is None else kept
-    kernels.add_table_gradient(into, points, grad, layout)
+    kernels.add_table_gradient(into, points, grad, layout, *padding)
     return into if kept is None else None
 
 
@@ -147,20 +152,23 @@ _held = _Held()
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, known: Any) -> Tensor:
+    def forward(
+        ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, known: Any, padding: Any
+    ) -> Tensor:
         ctx.save_for_backward(table, points)
-        ctx.layout, ctx.backend = layout, backend
+        ctx.layout, ctx.backend, ctx.padding = layout, backend, padding
         if known is not None:
             return known.view_as(known)
-        return backend.forward(table.detach(), points.detach(), layout)
+        return backend.forward(table.detach(), points.detach(), layout, *padding)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
         table, points = ctx.saved_tensors  # type: ignore[attr-defined]
         layout, backend = ctx.layout, ctx.backend  # type: ignore[attr-defined]
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad = grad.float().contiguous()
-        grad_table = table_gradient(table, points, grad, layout, backend) if wants_table else None
+        padding = ctx.padding  # type: ignore[attr-defined]
+        grad_table = table_gradient(table, points, grad, layout, backend, padding) if wants_table else None
         grad_points = backend.point_gradient(table.detach(), points, grad, layout) if wants_points else None
-        return grad_table, grad_points, None, None, None
+        return grad_table, grad_points, None, None, None, None

@@ -13,9 +13,11 @@ from typing import Any, no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import BFloat16, Float
+from jaxtyping import BFloat16, Float, Int
 from torch import Tensor
 from triton.runtime.errors import OutOfResources
+
+from nerf_lightning.nerf.kernels.padding import end_of_rows
 
 log = logging.getLogger(__name__)
 
@@ -61,14 +63,17 @@ def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
 
 
 def forward(
-    points: Float[Tensor, "points in"], weights: Sequence[Tensor], keep: bool
+    points: Float[Tensor, "points in"], weights: Sequence[Tensor], keep: bool, used: Int[Tensor, "1"] | None = None
 ) -> tuple[Float[Tensor, "points out"], BFloat16[Tensor, "kept words"]]:
-    """Return the outputs, and the inputs of all layers where they are to be kept."""
+    """Return the outputs, and the inputs of all layers where they are to be kept; zeros from row `used` on.
+
+    Up to a block: a program whose rows are all padding computes nothing.
+    """
     widths, rows = _padded_widths(weights), points.shape[0]
     out = torch.empty(rows, weights[-1].shape[0], device=points.device)
     kept = out.new_empty(rows if keep else 0, sum(widths[:-1]), dtype=torch.bfloat16)
     if rows:
-        arrays = points.contiguous(), *_three(weights), out, kept
+        arrays = points.contiguous(), *_three(weights), out, kept, used
         flags = len(weights), keep, BLOCK, INTERPRETED
         _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *_sizes(weights, widths), *flags, **FORWARD)
     return out, kept
@@ -76,9 +81,9 @@ def forward(
 
 def backward(
     grad: Float[Tensor, "points out"], weights: Sequence[Tensor], kept: BFloat16[Tensor, "points words"],
-    wants_points: bool,
+    wants_points: bool, used: Int[Tensor, "1"] | None = None,
 ) -> tuple[Float[Tensor, "points in"] | None, list[Tensor]]:  # fmt: skip
-    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
+    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned for the same `used`."""
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
     programs = max(1, min(PROGRAMS * _multiprocessors(grad.device), triton.cdiv(rows, BACKWARD_BLOCK)))
@@ -86,7 +91,7 @@ def backward(
     if not rows:
         sums.zero_()
     else:
-        arrays = grad.contiguous(), *_three(weights), kept, of_points, sums
+        arrays = grad.contiguous(), *_three(weights), kept, of_points, sums, used
         flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
         _backward[(programs,)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)
     total, grads, offset = sums.sum(dim=0), [], 0
@@ -182,7 +187,7 @@ def _activated(
 @triton.jit
 @no_type_check
 def _forward(
-    points, w0, w1, w2, out, kept, count,
+    points, w0, w1, w2, out, kept, used, count,
     n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
     d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
     layers: tl.constexpr, keep: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
@@ -190,6 +195,12 @@ def _forward(
     row = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
     valid = (row < count)[:, None]
     words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
+    if tl.program_id(0) * block >= end_of_rows(used, count):
+        width: tl.constexpr = d3 if layers == 3 else d2
+        column = tl.arange(0, width)[None, :]
+        nothing = tl.zeros([block, width], tl.float32)
+        tl.store(out + row[:, None] * n3 + column, nothing, mask=valid & (column < n3))
+        return
     x = _rows(points, row, count, n0, d0)
     y = _activated(x, w0, n0, n1, d0, d1, widen)
     if keep:
@@ -227,7 +238,7 @@ def _store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer:
 @triton.jit
 @no_type_check
 def _backward(
-    grad, w0, w1, w2, kept, of_points, sums, count,
+    grad, w0, w1, w2, kept, of_points, sums, used, count,
     n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
     d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
     layers: tl.constexpr, wants_points: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
@@ -235,7 +246,8 @@ def _backward(
     words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
     of_0, of_1 = tl.zeros([d1, d0], tl.float32), tl.zeros([d2, d1], tl.float32)
     of_2 = tl.zeros([d3, d2], tl.float32)
-    for start in range(tl.program_id(0) * block, count, tl.num_programs(0) * block):
+    last = end_of_rows(used, count)
+    for start in range(tl.program_id(0) * block, last, tl.num_programs(0) * block):
         row = (start + tl.arange(0, block)).to(tl.int64)
         valid = (row < count)[:, None]
         if layers == 3:
@@ -255,6 +267,14 @@ def _backward(
             there = valid & (column < n0)[None, :]
             into = of_points + row[:, None] * n0 + column[None, :]
             tl.store(into, _multiply(flowing, _weights(w0, n0, n1, d0, d1), widen), mask=there)
+    if used is not None and wants_points:
+        # What flows back from padding.
+        column = tl.arange(0, d0)[None, :]
+        first = (last + block - 1) // block * block
+        for start in range(first + tl.program_id(0) * block, count, tl.num_programs(0) * block):
+            row = (start + tl.arange(0, block)).to(tl.int64)[:, None]
+            nothing = tl.zeros([block, d0], tl.float32)
+            tl.store(of_points + row * n0 + column, nothing, mask=(row < count) & (column < n0))
     own = sums + tl.program_id(0) * (d0 * d1 + d1 * d2 + (d2 * d3 if layers == 3 else 0))
     _store_sum(own, 0, of_0, d0, d1)
     _store_sum(own, d0 * d1, of_1, d1, d2)

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
@@ -18,16 +18,27 @@ from nerf_lightning.nerf.matmul_precision import MatmulPrecision, linear
 
 
 def mlp(
-    points: Float[Tensor, "points in"], weights: list[Tensor], matmul_precision: MatmulPrecision = "float32"
+    points: Float[Tensor, "points in"],
+    weights: list[Tensor],
+    matmul_precision: MatmulPrecision = "float32",
+    used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
-    """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32."""
+    """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32.
+
+    Args:
+        points: the inputs.
+        weights: of each layer.
+        matmul_precision: of the products.
+        used: on CUDA, the row from which on all is padding: kernels do not compute it, and no gradient comes from it.
+    """
     found = _kernels_for(points, weights, matmul_precision)
     if found is None:
         return mlp_torch(points, weights, matmul_precision)
     kernels, dtype = found
+    padding = (used,) if used is not None and points.is_cuda else ()
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
-        return _TiledMLP.apply(points, kernels, dtype, *weights)
-    return kernels.forward(points.detach(), [weight.detach().to(dtype) for weight in weights], keep=False)[0]
+        return _TiledMLP.apply(points, kernels, dtype, padding, *weights)
+    return kernels.forward(points.detach(), [weight.detach().to(dtype) for weight in weights], False, *padding)[0]
 
 
 def mlp_torch(
@@ -61,17 +72,19 @@ def _kernels_for(
 
 class _TiledMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, kernels: ModuleType, dtype: torch.dtype, *weights: Tensor) -> Tensor:
-        used = [weight.detach().to(dtype) for weight in weights]
-        out, activations = kernels.forward(points.detach(), used, keep=True)
-        ctx.kernels, ctx.used, ctx.activations = kernels, used, activations
+    def forward(
+        ctx: Any, points: Tensor, kernels: ModuleType, dtype: torch.dtype, padding: tuple[Tensor, ...], *weights: Tensor
+    ) -> Tensor:
+        rounded = [weight.detach().to(dtype) for weight in weights]
+        out, activations = kernels.forward(points.detach(), rounded, True, *padding)
+        ctx.kernels, ctx.rounded, ctx.activations, ctx.padding = kernels, rounded, activations, padding
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         grad_points, grad_weights = ctx.kernels.backward(
-            grad.contiguous(), ctx.used, ctx.activations, ctx.needs_input_grad[0]
+            grad.contiguous(), ctx.rounded, ctx.activations, ctx.needs_input_grad[0], *ctx.padding
         )
         ctx.activations = None
-        return grad_points, None, None, *grad_weights
+        return grad_points, None, None, None, *grad_weights

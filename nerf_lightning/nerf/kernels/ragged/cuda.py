@@ -81,13 +81,34 @@ def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_belo
     return counts
 
 
+def first_of_each_ray(
+    samples: RaggedSamples,
+    counts: Int[Tensor, "rays"],
+    features: Float[Tensor, "n features"] | None,
+    capacity: int,
+) -> tuple[RaggedSamples, Float[Tensor, "capacity features"] | None]:
+    """Return the first `counts` samples of each ray, and their features."""
+    rays, width = counts.shape[0], 0 if features is None else features.shape[1]
+    index, bounds = counts.new_empty(capacity), torch.empty_like(samples.bounds)
+    starts, ends = samples.starts.new_empty(capacity), samples.ends.new_empty(capacity)
+    left = starts.new_empty(capacity, width)
+    found = torch.empty_like(samples.found)
+    given = samples.starts, samples.ends, samples.bounds, samples.found, counts.cumsum(0)
+    arrays = *given, starts if features is None else features.contiguous(), index, starts, ends, bounds, found, left
+    sizes = rays, capacity, width, triton.next_power_of_2(max(1, width))
+    _first[(max(1, rays),)](*arrays, *sizes, BLOCK, num_warps=1)
+    kept = RaggedSamples(index, starts, ends, bounds, found, samples.longest)
+    return kept, None if features is None else left
+
+
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
     one, bounds = torch.ones(2, device=device), torch.tensor([0, 1, 2], device=device)
     given = one, torch.ones(2, 3, device=device), 0 * one, one, bounds
     foreground, opacity, depth, weights = integrate(*given)
     integrate_gradient(*given, weights, foreground, opacity, depth, weights)
-    num_visible(one, RaggedSamples(bounds[:2], 0 * one, one, bounds, bounds[-1]), 0.5)
+    samples = RaggedSamples(bounds[:2], 0 * one, one, bounds, bounds[-1])
+    first_of_each_ray(samples, num_visible(one, samples, 0.5), one[:, None], 2)
     if abs(float(opacity[1]) - 0.6321206) > 1e-5:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
@@ -232,3 +253,43 @@ def _num_visible(density, starts, ends, bounds, counts, opaque_below, block: tl.
         before += tl.sum(optical, axis=0)
         seen += tl.sum((valid & (light > opaque_below)).to(tl.int64), axis=0)
     tl.store(counts + ray, seen)
+
+
+@triton.jit
+@no_type_check
+def _first(
+    starts, ends, bounds, found, ends_of_rays, features, to_index, to_starts, to_ends, to_bounds, to_found, to_features,
+    rays, capacity, width: tl.constexpr, columns: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    ray, lane, column = tl.program_id(0).to(tl.int64), tl.arange(0, block), tl.arange(0, columns)[None, :]
+    total = tl.load(ends_of_rays + rays - 1, mask=rays > 0, other=0)
+    used = tl.minimum(total, capacity)
+    if ray == 0:
+        tl.store(to_bounds + rays, used)
+        tl.store(to_found, total + tl.load(found) - tl.load(bounds + rays))
+    if ray < rays:
+        begin = tl.load(ends_of_rays + ray - 1, mask=ray > 0, other=0)
+        first, last = tl.minimum(begin, capacity), tl.minimum(tl.load(ends_of_rays + ray), capacity)
+        tl.store(to_bounds + ray, first)
+        shift = tl.load(bounds + ray) - begin
+        for start in range(first, last, block):
+            slot = start + lane
+            inside = slot < last
+            tl.store(to_index + slot, ray + 0 * slot, mask=inside)
+            tl.store(to_starts + slot, tl.load(starts + slot + shift, mask=inside, other=0.0), mask=inside)
+            tl.store(to_ends + slot, tl.load(ends + slot + shift, mask=inside, other=0.0), mask=inside)
+            if width > 0:
+                row, there = slot[:, None], inside[:, None] & (column < width)
+                values = tl.load(features + (row + shift) * width + column, mask=there, other=0.0)
+                tl.store(to_features + row * width + column, values, mask=there)
+        # Padding of no length, spread over the rays.
+        for start in range(used + ray * block, capacity, rays * block):
+            slot = start + lane
+            inside = slot < capacity
+            tl.store(to_index + slot, slot % rays, mask=inside)
+            tl.store(to_starts + slot, tl.zeros([block], tl.float32), mask=inside)
+            tl.store(to_ends + slot, tl.zeros([block], tl.float32), mask=inside)
+            if width > 0:
+                there = inside[:, None] & (column < width)
+                nothing = tl.zeros([block, columns], tl.float32)
+                tl.store(to_features + slot[:, None] * width + column, nothing, mask=there)

@@ -11,7 +11,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import backend_for, cuda_backend
-from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
+from nerf_lightning.nerf.kernels.ragged.reference import (
+    first_of_each_ray_torch,
+    integrate_torch,
+    transmittance_torch,
+)
 from nerf_lightning.nerf.types.rays import RaggedSamples
 
 Integrated = tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "*samples"]]
@@ -61,6 +65,29 @@ def num_visible(density: Float[Tensor, "capacity"], samples: RaggedSamples, opaq
     padding = torch.arange(density.shape[0], device=density.device) < samples.bounds[-1]
     seen = (transmittance_torch(density, samples) > opaque_below) & padding
     return counts.index_add(0, samples.ray_index, seen.to(counts.dtype))
+
+
+def first_of_each_ray(
+    samples: RaggedSamples,
+    counts: Int[Tensor, "rays"],
+    features: Float[Tensor, "capacity features"] | None = None,
+    capacity: int | None = None,
+) -> tuple[RaggedSamples, Float[Tensor, "kept features"] | None]:
+    """Return the first `counts` samples of each ray, and their features, without gradients.
+
+    `found` is then the number of those and of the samples that had been dropped before, which nobody has looked at.
+
+    Args:
+        samples: all of them.
+        counts: how many of each ray are kept.
+        features: of all samples, if there are any; padding gets zeros.
+        capacity: size of the arrays returned; nothing is read on the host, and what does not fit is dropped from the
+            last rays. None: as many as there are.
+    """
+    backend = cuda_backend("ragged.cuda", counts.device)
+    if backend is not None and capacity is not None:
+        return backend.first_of_each_ray(samples, counts, features, capacity)
+    return first_of_each_ray_torch(samples, counts, features, capacity)
 
 
 class _Integrate(torch.autograd.Function):

@@ -1,7 +1,9 @@
 """Rendering of ragged samples in plain torch: the reference, and what runs without kernels."""
 
+from dataclasses import replace
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -34,3 +36,25 @@ def integrate_torch(
     columns = torch.cat([weights[:, None] * rgb, weights[:, None], (weights * samples.midpoints)[:, None]], dim=-1)
     sums = columns.new_zeros(num_rays, 5).index_add(0, samples.ray_index, columns)
     return sums[:, :3], sums[:, 3], sums[:, 4], weights
+
+
+def first_of_each_ray_torch(
+    samples: RaggedSamples,
+    counts: Int[Tensor, "rays"],
+    features: Float[Tensor, "capacity features"] | None,
+    capacity: int | None,
+) -> tuple[RaggedSamples, Float[Tensor, "kept features"] | None]:
+    """Return the first `counts` samples of each ray, and their features."""
+    keep = samples.sample_index < counts.index_select(0, samples.ray_index)
+    bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    found = bounds[-1] + samples.found - samples.bounds[-1]
+    kept = keep.nonzero() if capacity is None else torch.nonzero_static(keep, size=capacity, fill_value=0)
+    left = replace(samples.at(kept[:, 0], bounds), found=found)
+    of_left = None if features is None else features.index_select(0, kept[:, 0])
+    if capacity is None:
+        return left, of_left
+    bounds, slot = bounds.clamp(max=capacity), torch.arange(capacity, device=counts.device)
+    filled = slot < bounds[-1]
+    ray = torch.where(filled, left.ray_index, slot % max(1, counts.shape[0]))
+    left = replace(left, ray_index=ray, starts=left.starts * filled, ends=left.ends * filled, bounds=bounds)
+    return left, None if of_left is None else of_left * filled[:, None]

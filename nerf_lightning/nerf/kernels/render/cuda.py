@@ -6,6 +6,7 @@ plain torch would compute in dozens of passes. `TRITON_INTERPRET=1` runs the ker
 same in each run, but for the gradient of the hash grid, which is summed up atomically.
 """
 
+from dataclasses import replace
 from typing import Any, no_type_check
 
 import torch
@@ -32,6 +33,7 @@ def render(
     matmul_precision: MatmulPrecision,
     closed: bool,
     whole_from: float,
+    features: Float[Tensor, "samples features"] | None,
 ) -> Integrated:
     """Return what is seen along rays, with gradients for the field's table and weights.
 
@@ -42,13 +44,16 @@ def render(
         matmul_precision: of the perceptrons' products.
         closed: whether the last sample of a ray takes all the light that is left.
         whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
+        features: of the hash grid, where `density` has computed them; None: they are computed here.
     """
     where = _Where(rays, samples)
     points = _points(rays, where, field)
-    hidden = mlp(interpolate(field.table, points, field.layout), field.density_weights, matmul_precision)
+    features = interpolate(field.table, points, field.layout, features, where.used)
+    hidden = mlp(features, field.density_weights, matmul_precision, where.used)
     raw = hidden.new_empty(0, 3)
     if field.color_weights:
-        raw = mlp(_Joined.apply(hidden, field.ray_features(rays), where), field.color_weights, matmul_precision)
+        joined = _Joined.apply(hidden, field.ray_features(rays), where)
+        raw = mlp(joined, field.color_weights, matmul_precision, where.used)
     density, rgb = _Activated.apply(hidden, raw, points, where, field, whole_from)
     if isinstance(samples, RaggedSamples):
         return integrate(density, rgb, samples)
@@ -56,6 +61,19 @@ def render(
     found = integrate_dense(density.view(shape), rgb.view(*shape, 3), samples.edges, closed)
     assert found is not None
     return found
+
+
+def density(
+    rays: RayBundle, samples: RaggedSamples, field: FieldParts, matmul_precision: MatmulPrecision
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]]:
+    """Return the density at samples, and the features of the hash grid there, without gradients."""
+    where = _Where(rays, samples)
+    points = _points(rays, where, field)
+    with torch.no_grad():
+        features = interpolate(field.table, points, field.layout, used=where.used)
+        hidden = mlp(features, field.density_weights, matmul_precision, where.used)
+        none = hidden.new_empty(0, 3)
+        return _Activated.apply(hidden, none, points, where, replace(field, color_weights=[]), 0.0)[0], features
 
 
 def trial(device: str = "cuda") -> None:
@@ -70,7 +88,7 @@ def trial(device: str = "cuda") -> None:
     field = FieldParts(aabb, table, layout, 0.0, weights[:1], weights[1:], lambda rays: rays.view_directions)
     samples = RaySamples(torch.tensor([[1.0, 2.0, 3.0]] * 2, device=device))
     with torch.enable_grad():
-        foreground, opacity, _, _ = render(rays, samples, field, "float32", False, 1.0)
+        foreground, opacity, _, _ = render(rays, samples, field, "float32", False, 1.0, None)
         (foreground.sum() + opacity.sum()).backward()
     if table.grad is None or not bool(table.grad.isfinite().all()) or float(opacity[0].detach()) < 0.9:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
@@ -85,6 +103,8 @@ class _Where:
         self.ray_index = samples.ray_index if isinstance(samples, RaggedSamples) else self.starts
         self.each = 0 if isinstance(samples, RaggedSamples) else samples.edges.shape[-1] - 1
         """Samples of every ray; 0: as the index says."""
+        self.used = samples.bounds[-1:] if isinstance(samples, RaggedSamples) else None
+        """How many there are before the padding, on the device; None: there is none."""
         self.count = self.starts.shape[0] if self.each == 0 else rays.near.shape[0] * self.each
 
     @property

@@ -100,16 +100,30 @@ def render_samples(
     matmul_precision: MatmulPrecision,
     closed: bool = False,
     whole_from: float = 0.0,
+    features: Float[Tensor, "samples features"] | None = None,
 ) -> Integrated | None:
     """Return what is seen along rays, by a few kernels on CUDA, which have gradients for the field's table and weights.
 
-    None where there are no such kernels, or other gradients are wanted. The other arguments are those of
-    `render_dense_rays`.
+    None where there are no such kernels, or other gradients are wanted. `features` are of the field's grid at the
+    samples, where they have been computed before. The other arguments are those of `render_dense_rays`.
     """
     if field is None or not takes_samples(rays, field):
         return None
     kernels: Any = cuda_backend(SAMPLES, rays.near.device)
-    return kernels.render(rays, samples, field, matmul_precision, closed, whole_from)
+    return kernels.render(rays, samples, field, matmul_precision, closed, whole_from, features)
+
+
+def sample_density(
+    rays: RayBundle, samples: RaggedSamples, field: FieldParts | None, matmul_precision: MatmulPrecision
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]] | None:
+    """Return the density at samples, and the features of the field's grid there, without gradients.
+
+    None where `render_samples` returns None.
+    """
+    if field is None or not takes_samples(rays, field):
+        return None
+    kernels: Any = cuda_backend(SAMPLES, rays.near.device)
+    return kernels.density(rays, samples, field, matmul_precision)
 
 
 def takes_samples(rays: RayBundle, field: FieldParts | None) -> bool:
