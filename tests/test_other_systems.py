@@ -13,7 +13,7 @@ from support import other_systems
 from support.captures import real_capture, write_npz
 from support.command_fixtures import *  # noqa: F403
 from support.ports import unused_port
-from support.running import FAST, REPOSITORY, finished, saved, start_cold
+from support.running import FAST, FAST_SWEEP, REPOSITORY, finished, saved, start_cold
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux stands in for the others")
 SYSTEMS = pytest.mark.parametrize("system", ["win32", "darwin"])
@@ -58,7 +58,7 @@ def test_the_main_commands_do_their_work(system, tmp_path):
         f"export ckpt={tmp_path}/run what=points paths.output_dir={tmp_path}/points",
         f"doctor {scene} paths.output_dir={tmp_path}/doctor",
         f"table {tmp_path} paths.output_dir={tmp_path}/table",
-        f"train -m {scene} {' '.join(FAST)} seed=1,2 final.video=false paths.output_dir={tmp_path}/sweep",
+        f"train -m {scene} {' '.join(FAST_SWEEP)} seed=1,2 final.video=false paths.output_dir={tmp_path}/sweep",
     )  # fmt: skip
     made = {path.name for path in tmp_path.rglob("*")}
     assert made >= {"last.ckpt", "metrics.json", "video.mp4", "doctor.json", "sweep.csv", "points.ply"}
@@ -96,8 +96,8 @@ def test_the_page_shows_pictures_until_ctrl_c(system, finished_run, tmp_path):
 def test_parallel_jobs_save_when_they_are_stopped(system, capture, tmp_path):
     """On Windows, the stop file alone tells them: SIGTERM would end them at once."""
     env = other_systems.environment(system, tmp_path)
-    jobs = (*FAST, "hydra/launcher=parallel", "seed=0,1,2", "final.video=false", f"paths.output_dir={tmp_path}/sweep")
-    words = ("train", "-m", "scene=npz", f"scene.path={capture}", *jobs, "trainer.max_steps=100000")
+    jobs = (*FAST_SWEEP, "hydra/launcher=parallel", "seed=0,1,2", "final.video=false", "trainer.max_steps=100000")
+    words = ("train", "-m", "scene=npz", f"scene.path={capture}", *jobs, f"paths.output_dir={tmp_path}/sweep")
     process = start_cold("nerf_lightning", *words, env=env, start_new_session=True)
     while process.poll() is None and len(list(tmp_path.glob("sweep/*/checkpoints/last.ckpt"))) < 2:
         time.sleep(0.1)

@@ -83,10 +83,15 @@ def _view(arguments: list[str]) -> list[str]:
 def _export(arguments: list[str]) -> list[str]:
     """Name the run's own scene as for `eval` where the exporter needs photographs; where it is unknown, do without."""
     typed = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
-    name = typed[-1] if typed else "page"  # as in conf/export.yaml
     with quick_imports():
         from nerf_lightning.config.exporters import exporter_class
+        from nerf_lightning.config.manual.catalogue import command_named
 
+        if not typed:
+            command = command_named("export")
+            assert command is not None
+            typed = [str(dict(command.groups)["what"])]
+        name = typed[-1]
         exporter = exporter_class(name)
     # Nothing is known here of an exporter of a person's own: it may need them.
     if exporter is not None and not getattr(exporter, "needs_photographs", False):

@@ -16,7 +16,8 @@ DAY = 86_400
 LINE_SECONDS = 30.0
 """Time between two lines that say how far something is, where no bar can be shown."""
 FORESEEN_FROM = 0.05
-"""The part that is done when those lines begin to say how long is left: until then, compiling kernels may dominate."""
+"""The part that is done when they, and the bar of a training, begin to say how long is left: kernels are compiled at
+the start, so it says little of the rest."""
 
 Item = TypeVar("Item")
 log = logging.getLogger(__name__)

@@ -10,13 +10,10 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.console import FORESEEN_FROM, spoken
 from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.launch.trainer import MOST_STEPS
-
-EARLY = 0.05
-"""The share of a run whose speed says little of the rest."""
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +83,7 @@ class TrainingProgress(ProgressBar):
     def _left(self, step: int, total: int, seconds: float) -> str:
         """Return the time left after so many seconds, once enough of the run is over to know it."""
         done, asked = step - self.first_step, total - self.first_step
-        return "" if done < max(1, EARLY * asked) else f"about {spoken((total - step) * seconds / done)} left"
+        return "" if done < max(1, FORESEEN_FROM * asked) else f"about {spoken((total - step) * seconds / done)} left"
 
     def leave_out(self, seconds: float) -> None:
         """Do not count the last so many seconds: the training paused."""
