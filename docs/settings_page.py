@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.config.manual.catalogue import Command, Setting, command_named
-from nerf_lightning.config.manual.pages import brief
+from nerf_lightning.config.help.catalogue import Command, Setting, command_named
+from nerf_lightning.config.help.pages import brief
 
 HEAD = """# Settings
 

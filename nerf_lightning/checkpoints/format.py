@@ -57,7 +57,7 @@ TRAINING: dict[str, Any] = {
     "optimizer_states": list[dict[str, object]],
     "lr_schedulers": list[object],
 }
-"""What training goes on from, beside the record; the run that does holds it against its own (`training/resume.py`)."""
+"""What training goes on from, beside the record; the run that does holds it against its own (`training/restore.py`)."""
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
 OF_AVERAGING: dict[str, Any] = {"current_model_state": dict[str, Tensor], "averaging_state": dict[str, Tensor]}

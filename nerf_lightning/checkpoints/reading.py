@@ -4,7 +4,7 @@ A checkpoint is tensors and plain containers only, so it loads with `weights_onl
 Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
 config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learned, where they were),
 quantized (weights in fewer bytes, where it was made smaller), pixels (a hash of each photograph), and the run's state
-(`training/resume.py`).
+(`training/restore.py`).
 """
 
 import contextlib

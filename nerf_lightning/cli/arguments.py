@@ -5,8 +5,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
-from nerf_lightning.config.manual.catalogue import command_named, known_names
-from nerf_lightning.config.manual.suggestions import did_you_mean
+from nerf_lightning.config.help.catalogue import command_named, known_names
+from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve", "--config-dir", "--hydra-help")

@@ -19,7 +19,7 @@ from nerf_lightning.cli.prepare import PATHS_ALONE, prepared
 from nerf_lightning.cli.process import ends_quietly, require_no_settings_here, was_interrupted
 from nerf_lightning.cli.quoting import quoted_paths
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
-from nerf_lightning.config.manual.suggestions import did_you_mean
+from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.messages.errors import InputError

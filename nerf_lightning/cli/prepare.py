@@ -85,7 +85,7 @@ def _export(arguments: list[str]) -> list[str]:
     typed = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
     with quick_imports():
         from nerf_lightning.config.exporters import exporter_class
-        from nerf_lightning.config.manual.catalogue import command_named
+        from nerf_lightning.config.help.catalogue import command_named
 
         if not typed:
             command = command_named("export")

@@ -13,7 +13,7 @@ from rich.progress import track
 from torch.utils import collect_env
 
 from nerf_lightning import __version__
-from nerf_lightning.compute.devices import has_tf32
+from nerf_lightning.compute.precision import has_tf32
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json

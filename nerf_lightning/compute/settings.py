@@ -8,15 +8,8 @@ from torch import distributed
 
 from nerf_lightning.compute import ranks, xla_device
 from nerf_lightning.compute.cores import MOST_THREADS
-from nerf_lightning.compute.devices import (
-    Accelerator,
-    Precision,
-    choose_device,
-    choose_precision,
-    prepare_machine,
-    suited,
-    working_device,
-)
+from nerf_lightning.compute.devices import Accelerator, choose_device, prepare_machine, working_device
+from nerf_lightning.compute.precision import Precision, choose_precision, suited
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.models.base import Model

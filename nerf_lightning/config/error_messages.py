@@ -12,9 +12,9 @@ from hydra.errors import HydraException, InstantiationException
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from nerf_lightning.config.help.catalogue import Command, command_named, known_names
+from nerf_lightning.config.help.suggestions import did_you_mean, near
 from nerf_lightning.config.lightning_arguments import OWNED
-from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
-from nerf_lightning.config.manual.suggestions import did_you_mean, near
 from nerf_lightning.config.overrides import PLAIN, to_type
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError

@@ -16,8 +16,9 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.psnr import picture_psnr
 from nerf_lightning.nerf.row_chunks import row_chunks
 
-SSIM_WINDOW = 11
-"""Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
+SSIM_SIGMA = 1.5
+SSIM_WINDOW = 2 * int(3.5 * SSIM_SIGMA + 0.5) + 1
+"""Pixels across the Gaussian window that torchmetrics chooses for a standard deviation of SSIM_SIGMA pixels: 11."""
 HIGHER_IS_BETTER = ("psnr", "cc_psnr", "ssim")
 """Of the others, which are errors, the lower is better."""
 
@@ -66,7 +67,9 @@ def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "h
     for rows in row_chunks(height, render.shape[1]):
         top, bottom = max(0, rows.start - reach), min(height, max(rows.stop + reach, SSIM_WINDOW))
         ours, true = (picture[top:bottom].movedim(-1, 0)[None] for picture in (render, truth))
-        _, each = structural_similarity_index_measure(ours, true, data_range=1.0, return_full_image=True)
+        _, each = structural_similarity_index_measure(
+            ours, true, sigma=SSIM_SIGMA, data_range=1.0, return_full_image=True
+        )
         assert isinstance(each, Tensor)
         total += float(each[..., rows.start - top : rows.stop - top, :].mean()) * (rows.stop - rows.start)
     return total / height

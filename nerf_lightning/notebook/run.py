@@ -29,7 +29,7 @@ from nerf_lightning.notebook.trained_model import TrainedModel
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard
 from nerf_lightning.training.callbacks.nan_guard import CURE, NanGuard
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.resume import loops_after, require_resumable, restore_run
+from nerf_lightning.training.restore import loops_after, require_resumable, restore_run
 from nerf_lightning.training.run import Run, assemble
 from nerf_lightning.training.step_guard import first_not_finite
 

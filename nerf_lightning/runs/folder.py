@@ -11,7 +11,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -21,26 +21,23 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
-from nerf_lightning.config.overrides import key_of, leaves, to_type
+from nerf_lightning.config.overrides import key_of
 from nerf_lightning.config.setting_rules import fingerprint
 from nerf_lightning.files.atomic import persistently, whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import child_of, make_folder, require_no_way_out, require_run
-from nerf_lightning.files.regular import open_to_append, what_is
-from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.files.regular import open_to_append
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import EscapingFormatter, is_plain
 from nerf_lightning.runs.identity import run_identity, settings_digest
-from nerf_lightning.runs.summary import folders_of_runs, read_note
+from nerf_lightning.runs.resume import newest_unfinished, require_same_run, run_to_resume
+from nerf_lightning.runs.summary import read_note
 
 log = logging.getLogger(__name__)
-
-UNKNOWN = "unknown"  # What stands for the value of a setting where a config does not have it
 
 
 @dataclass(frozen=True)
@@ -140,7 +137,7 @@ def open_run(
             )
     folder, resuming = _choose(config, identity, num_steps, job_folder)
     if (folder / "run.json").exists():
-        _require_same_run(folder, identity, set(map(key_of, typed)), resuming)
+        require_same_run(folder, identity, set(map(key_of, typed)), resuming)
     require_no_way_out(folder)
     try:
         lock = FileLock(make_folder(folder, ".hydra") / "lock")
@@ -162,23 +159,6 @@ def open_run(
     write_json(folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings} | kept | job)
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
-
-
-def former_config(config: DictConfig, job_folder: Path | None) -> Mapping[str, Any] | None:
-    """Return what a folder keeps of its run's config, where it is known before the run is; None where there is none.
-
-    Nothing in it is built: the folder may come from anybody.
-    """
-    named = required_path("resume", config.resume) if config.resume not in (None, "auto") else None
-    path = named or job_folder or config.paths.output_dir
-    if path is None:
-        return None
-    folder = Path(path).parent.parent if Path(path).suffix == ".ckpt" else Path(path)
-    try:
-        content = read_plain_yaml(folder / ".hydra" / "config.yaml")
-    except InputError:
-        return None  # whoever goes on with it is told
-    return content if isinstance(content, dict) else None
 
 
 def job_folder() -> Path | None:
@@ -204,111 +184,15 @@ def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_fo
     """Return the folder, and whether what is there is to be gone on with."""
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
-        return _to_resume(Path(required_path("resume", resume))), True
+        return run_to_resume(Path(required_path("resume", resume))), True
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()
         length = num_steps, number(config.budget.seconds)
-        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), length, of_job)
+        folder = newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), length, of_job)
     if folder is None:
         return _fresh(child_of(Path(config.paths.root_dir), str(config.scene.name))), False
     return folder, resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
-
-
-def _to_resume(path: Path) -> Path:
-    folder = path.parent.parent if path.suffix == ".ckpt" else path
-    if path.suffix == ".ckpt" and not path.is_file():
-        raise InputError(f"resume={path}: {path} {what_is(path)}. A run keeps last.ckpt and best.ckpt.")
-    if not (folder / "run.json").is_file():
-        raise InputError(
-            f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
-            "resume=auto for the newest unfinished run of this config."
-        )
-    return folder
-
-
-def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
-    begun_with, note = read_note(folder).get("fingerprint"), folder / "run.json"
-    if begun_with is None:
-        raise InputError(
-            f"{note} is {'damaged' if note.stat().st_size else 'empty'}, so it does not say which run this is. Remove "
-            f"it; a run with the same settings (.hydra/overrides.yaml) and {to_type('paths.output_dir', str(folder))} "
-            "then resumes from its checkpoints. Or give another folder with paths.output_dir=DIR."
-        )
-    other = _former_identity(folder)
-    older = isinstance(other, dict) and identity == other and _is_as_begun(folder, other)
-    if begun_with == fingerprint(identity) or older:
-        if resuming:
-            return
-        raise InputError(
-            f"{folder} already contains a run with these settings. Add resume=auto to resume it, or give another "
-            "folder with paths.output_dir=DIR."
-        )
-    newer = _newer_settings(folder, identity, other) if isinstance(other, dict) and resuming else []
-    if newer and not typed & set(newer):
-        shown = ", ".join(f"{key}={identity[key]}" for key in newer)
-        log.warning("The run in %s was started before these settings existed, and continues with %s.", folder, shown)
-        return
-    difference = _difference(identity, other) if isinstance(other, dict) else other
-    raise InputError(
-        f"{folder} contains a run with other settings ({difference}). Give the settings that it was started with "
-        "(.hydra/overrides.yaml), or another folder with paths.output_dir=DIR."
-    )
-
-
-def _newer_settings(folder: Path, identity: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """Return the settings that came into the program after a run was begun; none where anything else differs."""
-    known = {key: value for key, value in identity.items() if key in other}
-    return sorted(identity.keys() - other.keys()) if known == other and _is_as_begun(folder, other) else []
-
-
-def _is_as_begun(folder: Path, other: dict[str, Any]) -> bool:
-    """Tell whether the run in a folder began with what its config says now.
-
-    Versions up to 1.0.0 counted the budget to a run's identity.
-    """
-    budget = leaves(read_plain_yaml(folder / ".hydra" / "config.yaml").get("budget"), "budget")
-    return read_note(folder).get("fingerprint") in (fingerprint(other), fingerprint(other | budget))
-
-
-def _former_identity(folder: Path) -> dict[str, Any] | str:
-    """Return what the run in a folder is, by the config that it was begun with, or why that is not known."""
-    saved = folder / ".hydra" / "config.yaml"
-    if not saved.is_file():
-        return "its config was not kept"
-    content = read_plain_yaml(saved)
-    if not isinstance(content, dict):
-        return "its config is damaged"
-    try:
-        return run_identity(OmegaConf.create(content))
-    except OmegaConfBaseException:
-        return "its config is damaged"
-
-
-def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
-    pairs = {key: (other.get(key, UNKNOWN), identity.get(key, UNKNOWN)) for key in identity.keys() | other.keys()}
-    differing = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
-    keys = sorted(differing, key=lambda key: (key not in other, key))  # what came after the run began is told last
-    shown = ", ".join("{}: there {}, here {}".format(key, *differing[key]) for key in keys[:4])
-    return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
-
-
-def _newest_unfinished(root: Path, digest: str, length: tuple[int, float | None], of_job: str | None) -> Path | None:
-    folders = folders_of_runs(root)
-    for folder in sorted(folders, key=lambda folder: (folder / "run.json").stat().st_mtime, reverse=True):
-        note = read_note(folder)
-        ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
-        if ours and not _is_over(note, *length):
-            return folder
-    return None
-
-
-def _is_over(note: Mapping[str, Any], num_steps: int, seconds: float | None) -> bool:
-    """Tell whether a run has finished and would take no further step with so many steps and seconds."""
-    finished, used = number(note.get("finished_at_step")), number(note.get("budget_seconds"))
-    if finished is None:
-        return False
-    return finished >= num_steps or (seconds is not None and used is not None and used >= seconds)
 
 
 def _fresh(parent: Path) -> Path:

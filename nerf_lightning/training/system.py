@@ -24,7 +24,7 @@ from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run, require_fitting
 from nerf_lightning.training.rendering_step import rendering_step
-from nerf_lightning.training.resume import require_resumable, restore_run, run_state
+from nerf_lightning.training.restore import require_resumable, restore_run, run_state
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.step_guard import first_not_finite
 from nerf_lightning.training.validation import RayErrors

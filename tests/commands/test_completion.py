@@ -12,7 +12,7 @@ from support.running import REPOSITORY, said
 from support.systems import POSIX
 
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
-from nerf_lightning.config.manual.candidates import candidates
+from nerf_lightning.config.help.candidates import candidates
 
 NAMES = [*find_commands(), *OF_ITSELF]
 PATIENCE = 30.0

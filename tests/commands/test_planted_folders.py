@@ -16,7 +16,8 @@ from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import saved_overrides
-from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
+from nerf_lightning.runs.folder import RunFolder, open_run
+from nerf_lightning.runs.resume import _former_identity, newest_unfinished
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep, to_give_again
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.runs.sweep import Sweep
@@ -395,7 +396,7 @@ def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
     """The note is anybody's; a training that goes on in its folder writes its own numbers there at the end."""
     note = {"fingerprint": "0", "seconds": value, "finished_at_step": value}
     (run / "run.json").write_text(json.dumps(note))
-    assert _newest_unfinished(run.parent, "0", (10, 60.0), None) == run
+    assert newest_unfinished(run.parent, "0", (10, 60.0), None) == run
     RunFolder(run, FileLock(run / "lock"), None).note(finished_at_step=12)
     found = read_note(run)
     assert found["finished_at_step"] == 12

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support.scenes import tiny_model
 
-from nerf_lightning.compute import devices
+from nerf_lightning.compute import precision
 from nerf_lightning.compute import settings as compute_settings
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import Linear
@@ -16,7 +16,7 @@ def native(monkeypatch):
     monkeypatch.delenv("NERF_LIGHTNING_PRECISION", raising=False)
 
     def pretend(answer):
-        monkeypatch.setattr(devices, "has_native_bfloat16", lambda device_type: answer)
+        monkeypatch.setattr(precision, "has_native_bfloat16", lambda device_type: answer)
 
     return pretend
 
@@ -31,7 +31,7 @@ def test_precision_and_device_follow_the_machine_with_their_reasons(native, monk
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "(no GPU found)" in TrainerSettings().describe()
     assert "(as asked)" in TrainerSettings(accelerator="cpu").describe()
-    assert devices.has_native_bfloat16("cpu") in (True, False)
+    assert precision.has_native_bfloat16("cpu") in (True, False)
 
 
 def test_the_environment_says_what_auto_means(native, monkeypatch, caplog):

@@ -25,7 +25,7 @@ from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
-from nerf_lightning.runs.folder import former_config
+from nerf_lightning.runs.resume import former_config
 
 IN_A_BOX = ball_scene()
 PHOTOGRAPHS = replace(IN_A_BOX, space="contracted")

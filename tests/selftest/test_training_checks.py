@@ -6,10 +6,10 @@ import sys
 import pytest
 import torch
 
-from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
 from nerf_lightning.nerf.kernels.render import dense as dense_rays_cpu
+from nerf_lightning.nerf.kernels.table_adam import cpu as adam_cpu
 from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out

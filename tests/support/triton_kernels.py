@@ -13,10 +13,10 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.adam.op import adam_step_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.ragged.reference import first_of_each_ray_torch, integrate_torch, transmittance_torch
+from nerf_lightning.nerf.kernels.table_adam.op import adam_step_torch
 from nerf_lightning.nerf.losses.proposal import distortion_loss, interlevel_loss
 from nerf_lightning.nerf.randomness import batch_random, purpose_word
 from nerf_lightning.nerf.rendering.histograms import sample_histogram

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, pictures_below
+from nerf_lightning.data.captures.find_pictures import PICTURE_FOLDERS, pictures_below
 from nerf_lightning.files.regular import what_is
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

@@ -7,7 +7,8 @@ import torch
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, cameras_as_given
-from nerf_lightning.data.pixels.picture_files import QUARTER_TURNS, downscaled_size, read_header
+from nerf_lightning.data.pixels.downscale import downscaled_size
+from nerf_lightning.data.pixels.picture_files import QUARTER_TURNS, read_header
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 

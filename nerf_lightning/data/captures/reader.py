@@ -18,11 +18,11 @@ from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import check_metres, check_step, usable
 from nerf_lightning.data.captures.folders import located, named_folder, require_one
 from nerf_lightning.data.captures.intrinsics import as_calibrated, cameras_of
-from nerf_lightning.data.captures.masks import with_masks
+from nerf_lightning.data.captures.mask_files import with_masks
 from nerf_lightning.data.captures.scene import Coordinates, Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoded_photographs import read_photographs, upright_size
-from nerf_lightning.data.pixels.picture_files import MaskColor
+from nerf_lightning.data.pixels.masks import MaskColor
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader

@@ -12,19 +12,10 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
+from nerf_lightning.data.pixels.downscale import area_downscale, crop_to_multiple, downscaled_size, whole_blocks
 from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
-from nerf_lightning.data.pixels.picture_files import (
-    MaskColor,
-    PictureHeader,
-    area_downscale,
-    crop_to_multiple,
-    downscaled_size,
-    image_size,
-    read_header,
-    read_mask,
-    read_rgba,
-    whole_blocks,
-)
+from nerf_lightning.data.pixels.masks import MaskColor, read_mask
+from nerf_lightning.data.pixels.picture_files import PictureHeader, image_size, read_header, read_rgba
 from nerf_lightning.data.pixels.placement import num_bytes
 from nerf_lightning.data.pixels.store import each_or_faults, in_threads
 from nerf_lightning.files.folders import default_folder
@@ -55,7 +46,7 @@ class Photograph:
 
     path: Path
     mask: Path | None = None
-    """A gray picture of the same shape, white and black (`images.read_mask`)."""
+    """A gray picture of the same shape, white and black (`masks.read_mask`)."""
     mask_keeps: MaskColor | None = None
     """None: what the user says, else white."""
     radius: float | None = None

@@ -1,4 +1,4 @@
-"""Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
+"""Picture files to 8-bit RGBA with straight alpha, and depth maps."""
 
 import logging
 import math
@@ -14,10 +14,10 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache
 from io import BufferedReader
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from nerf_lightning.data.pixels.color_profiles import to_srgb
@@ -35,14 +35,6 @@ GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 QUARTER_TURNS = (5, 6, 7, 8)
 """Orientations that swap width and height."""
-KEEP_ABOVE = 127
-MOST_LEVELS = 16
-"""Of green in a mask that is no cut-out photograph, at most."""
-MaskColor = Literal["white", "black"]
-PIXELS_AT_ONCE = 1 << 16
-"""That are shrunk together: what is computed of them stays in the cache."""
-MOST_IN_32_BITS = (2**32 - 1) // (255 * (2 * 255 + 1))
-"""Pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
 JPEG_START, JPEG_BLOCK = b"\xff\xd8\xff", 64
 """Pixels of a block."""
 JPEG_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd9-\xfe]")
@@ -180,112 +172,6 @@ def read_depth(path: Path) -> tuple[Float32[np.ndarray, "height width"], bool]:
             return np.asarray(image).astype(np.float32), True
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
-
-
-def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels a picture keeps: the white ones or, where black is kept, the others.
-
-    White is brighter than 127 of 255; of two values on one side of that the larger one is, and 1 alone is white.
-    Where alpha, or red, is all that differs from pixel to pixel, it is the mask; of a cut-out photograph alpha is.
-
-    Raises:
-        InputError: what `read_rgba` refuses, and pictures with several channels that say different things.
-    """
-    rgba = read_rgba(path, upright, converts_colors=False)
-    # Of red, green, blue and alpha, those that differ from pixel to pixel.
-    said = [rgba[..., channel] for channel in range(4) if np.ptp(rgba[..., channel])]
-    if np.ptp(rgba[..., 3]) and np.count_nonzero(np.bincount(rgba[..., 1].ravel())) > MOST_LEVELS:
-        said = [rgba[..., 3]]
-    said = said or [rgba[..., 0]]
-    bright = [channel > _white_above(channel) for channel in said]
-    if any((channel != bright[0]).any() for channel in bright[1:]):
-        raise InputError(
-            f"The mask {path} has colors or transparent pixels, so it is unclear which pixels it keeps. Save it as a "
-            f"grayscale picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
-        )
-    return bright[0] if keep == "white" else ~bright[0]
-
-
-def _white_above(channel: UInt8[np.ndarray, "height width"]) -> int:
-    values = np.flatnonzero(np.bincount(channel.ravel()))
-    if values[0] <= KEEP_ABOVE < values[-1]:
-        return KEEP_ABOVE
-    if len(values) == 2:
-        return int(values[0])
-    return 0 if values[-1] == 1 else KEEP_ABOVE
-
-
-def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
-    """Return (width, height) of a photograph shrunk by a whole factor that need not divide its size.
-
-    What is left over at the right and at the bottom is cropped, so that focal length and principal point, which is
-    measured from the upper left corner, are divided by `factor` exactly.
-
-    >>> downscaled_size(1081, 720, 4)
-    (270, 180)
-
-    Raises:
-        InputError: nothing is left.
-    """
-    if not min(width, height) >= factor >= 1:
-        raise InputError(
-            f"scene.downscale={factor} leaves nothing of a photograph of {width} x {height} pixels. "
-            f"Choose a factor from 1 to {min(width, height)}."
-        )
-    return width // factor, height // factor
-
-
-def crop_to_multiple(picture: UInt8[np.ndarray, "height width *c"], factor: int) -> UInt8[np.ndarray, "h w *c"]:
-    """Return the picture without the rows at the bottom and columns at the right that `factor` leaves over."""
-    height, width = (side // factor * factor for side in picture.shape[:2])
-    return picture[:height, :width]
-
-
-def whole_blocks(kept: Bool[np.ndarray, "height width"], factor: int) -> Bool[np.ndarray, "h w"]:
-    """Return which blocks of `factor` x `factor` pixels are kept altogether; the rest of the picture is cropped."""
-    height, width = (side // factor for side in kept.shape)
-    blocks = kept[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    return np.asarray(blocks.all(axis=(1, 3)))
-
-
-def area_downscale(
-    rgba: UInt8[np.ndarray, "height width 4"], factor: int
-) -> UInt8[np.ndarray, "small_height small_width 4"]:
-    """Return the picture shrunk by a whole factor: each pixel is the mean of its block, premultiplied.
-
-    color = sum(rgb * a) / sum(a), alpha = mean(a), both rounded to 8 bits (halves up) and kept straight;
-    color is 0 where alpha is. The sums are integers, hence exact. `factor` must divide the size.
-    """
-    if factor == 1:
-        return rgba
-    height, width = rgba.shape[0] // factor, rgba.shape[1] // factor
-    small = np.empty((height, width, 4), dtype=np.uint8)
-    rows = max(1, PIXELS_AT_ONCE // (width * factor**2))
-    for top in range(0, height, rows):
-        small[top : top + rows] = _block_means(rgba[top * factor : (top + rows) * factor], factor)
-    return small
-
-
-def _block_means(rgba: UInt8[np.ndarray, "height width 4"], factor: int) -> UInt8[np.ndarray, "h w 4"]:
-    height, width, area = rgba.shape[0] // factor, rgba.shape[1] // factor, factor**2
-    blocks = rgba.reshape(height, factor, width, factor, 4)
-    # One pixel of each block at a time keeps the temporaries at the size of the small picture.
-    parts = (blocks[:, row, :, column] for row in range(factor) for column in range(factor))
-    total = np.zeros((height, width, 4), dtype=np.uint32 if area <= MOST_IN_32_BITS else np.uint64)
-    if (rgba[..., 3] == 255).all():  # all weights are alike: the same means with a fraction of the work
-        for part in parts:
-            total += part
-        return ((2 * total + area) // (2 * area)).astype(np.uint8)
-    for part in parts:
-        alpha = part[..., 3:].astype(np.uint32)
-        total[..., :3] += part[..., :3] * alpha
-        total[..., 3:] += alpha
-    weight = total[..., 3:]
-    small = np.empty((height, width, 4), dtype=np.uint8)
-    small[..., :3] = (2 * total[..., :3] + weight) // np.maximum(2 * weight, 1)
-    small[..., 3] = (2 * total[..., 3] + area) // (2 * area)
-    small[small[..., 3] == 0] = 0
-    return small
 
 
 class _JpegHeader(BufferedReader):

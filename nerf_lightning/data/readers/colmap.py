@@ -15,13 +15,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
-from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import (
+from nerf_lightning.data.captures.find_pictures import (
     PICTURE_FOLDERS,
     find_pictures,
     pictures_below,
     why_absent,
 )
+from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.readers.colmap_files import (

@@ -16,8 +16,8 @@ import numpy as np
 
 from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.find_pictures import find_pictures, why_absent
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures, why_absent
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header, read_rgba
 from nerf_lightning.data.pixels.plain_background import TOLERANCE

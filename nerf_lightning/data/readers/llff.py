@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.find_pictures import PICTURE_FOLDERS, numeric_order, pictures_by_stem
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, numeric_order, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import ENDINGS

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.find_pictures import find_pictures, pictures_below
 from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.readers.frames import (
     FoundFrame,

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.data.sfm.find_cameras import find_cameras
+from nerf_lightning.data.sfm.image_pairs import chosen_matching
 from nerf_lightning.data.sfm.panoramas import of_one_kind
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel
-from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching
+from nerf_lightning.data.sfm.settings import SfmSettings
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, child_of, empty_ours, make_folder, remove_empty

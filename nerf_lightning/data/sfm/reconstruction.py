@@ -12,18 +12,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.sfm.image_pairs import image_pairs, tiles_of
 from nerf_lightning.data.sfm.panoramas import lens_of, verification_of
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
-from nerf_lightning.data.sfm.settings import (
-    FEATURES,
-    MAPPING,
-    MATCHING,
-    Attempt,
-    CameraMode,
-    SfmSettings,
-    image_pairs,
-    tiles_of,
-)
+from nerf_lightning.data.sfm.settings import FEATURES, MAPPING, MATCHING, Attempt, CameraMode, SfmSettings
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError, require_extra
 from nerf_lightning.messages.escaping import listed

@@ -1,25 +1,20 @@
-"""Settings of structure from motion, which photographs are compared with each other, and what its stages cost."""
+"""Settings of structure from motion, what is tried in turn, and what its stages cost."""
 
 from dataclasses import dataclass
-from itertools import combinations, groupby
 from typing import Literal
 
 from nerf_lightning.compute.cores import num_cores
+from nerf_lightning.data.sfm.image_pairs import Matching, image_pairs
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
 from nerf_lightning.messages.errors import require_positive
 
-Matching = Literal["exhaustive", "sequential", "auto"]
 CameraMode = Literal["single", "per_image", "auto"]
 Panoramas = bool | Literal["auto"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 FEATURES, MATCHING, MAPPING = "finding features", "comparing photographs", "placing cameras"
-MOST_EXHAUSTIVE = 80
-NEIGHBOURS = 10
 FEW, SOME = 24, 80
 MAPPERS: tuple[Literal["incremental", "global"], ...] = ("incremental", "global")
-LANDMARKS = 40
-TILE = 12
 
 
 @dataclass(frozen=True)
@@ -97,41 +92,6 @@ def attempts(settings: SfmSettings, count: int) -> list[Attempt]:
     else:  # more would take hours
         features = [(2048, False)]
     return [Attempt(number, affine, mapper) for number, affine in features for mapper in MAPPERS]
-
-
-def chosen_matching(matching: Matching, count: int) -> Matching:
-    """Return how `count` photographs are compared: `auto` means all pairs while these are few (3160 for 80)."""
-    if matching != "auto":
-        return matching
-    return "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
-
-
-def image_pairs(matching: Matching, count: int) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of photographs 0 to count - 1 in the order in which they were taken.
-
-    Sequential: the ten that follow, those at a distance of a power of two, and all pairs among some forty spread over
-    the whole, so that a path that comes back to where it was is closed. The number grows with count log count.
-
-    >>> image_pairs("exhaustive", 3)
-    [(0, 1), (0, 2), (1, 2)]
-    >>> (0, 10) in image_pairs("sequential", 100), (0, 11) in image_pairs("sequential", 100)
-    (True, False)
-    """
-    if chosen_matching(matching, count) == "exhaustive":
-        return list(combinations(range(count), 2))
-    steps = {*range(1, NEIGHBOURS + 1), *(2**power for power in range(count.bit_length()))}
-    near = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    landmarks = range(0, count, -(-count // LANDMARKS))
-    return sorted(near | set(combinations(landmarks, 2)))
-
-
-def tiles_of(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Return the pairs in groups among few photographs: comparing a group loads and indexes each of these once."""
-
-    def tile(pair: tuple[int, int]) -> tuple[int, int]:
-        return pair[0] // TILE, pair[1] // TILE
-
-    return [list(group) for _, group in groupby(sorted(pairs, key=tile), key=tile)]
 
 
 def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings, attempt: Attempt) -> dict[str, float]:

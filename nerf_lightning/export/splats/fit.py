@@ -18,7 +18,7 @@ from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.views import View, color_behind
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
-from nerf_lightning.nerf.kernels.adam.op import adam_step
+from nerf_lightning.nerf.kernels.table_adam.op import adam_step
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.types.scene import DRAWN, Background
 

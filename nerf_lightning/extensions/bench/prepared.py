@@ -30,8 +30,8 @@ from nerf_lightning.training.tile_size import measured_tile
 
 # Without these, torch computes around the kernels of hash grids, random numbers and histograms.
 TWINS = (
-    *("march.cpu", "ragged.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"),
-    *("march.cuda", "ragged.cuda", "mlp.cuda", "adam.cuda", "render.cuda"),
+    *("march.cpu", "ragged.cpu", "mlp.cpu", "table_adam.cpu", "render.cpu", "render.gradients"),
+    *("march.cuda", "ragged.cuda", "mlp.cuda", "table_adam.cuda", "render.cuda"),
 )
 
 

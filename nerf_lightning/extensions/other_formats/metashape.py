@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.find_pictures import find_pictures
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.files.budgets import require_within

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.pictures import pictures_below
+from nerf_lightning.data.captures.find_pictures import pictures_below
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

@@ -12,8 +12,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.find_pictures import (
+    PICTURE_FOLDERS,
+    first_with_pictures,
+    numeric_order,
+    pictures_below,
+)
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order, pictures_below
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.find_pictures import pictures_below, pictures_by_stem
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header

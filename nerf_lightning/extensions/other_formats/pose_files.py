@@ -12,7 +12,7 @@ from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import pose_from_matrix
-from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
+from nerf_lightning.data.captures.find_pictures import pictures_below, pictures_by_stem
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

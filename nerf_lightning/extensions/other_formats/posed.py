@@ -14,8 +14,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, of_one_lens
 from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.find_pictures import PICTURE_FOLDERS, find_pictures, first_with_pictures
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, first_with_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header

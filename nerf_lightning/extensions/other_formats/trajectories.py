@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.pictures import numeric_order, pictures_below
+from nerf_lightning.data.captures.find_pictures import numeric_order, pictures_below
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

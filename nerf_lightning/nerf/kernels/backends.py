@@ -24,12 +24,12 @@ ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
 CPU_BACKENDS = (
     *("render.dense", "render.gradients", "render.cpu", "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
-    *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "adam.cpu"),
+    *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "table_adam.cpu"),
 )
 """The modules that numba compiles, those that take longest first."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
-    *("render.cuda", "histograms.cuda", "adam.cuda", "pixels.cuda", "rays.cuda"),
+    *("render.cuda", "histograms.cuda", "table_adam.cuda", "pixels.cuda", "rays.cuda"),
 )
 """The modules that triton compiles."""
 FP_FUSION = "TRITON_DEFAULT_FP_FUSION"

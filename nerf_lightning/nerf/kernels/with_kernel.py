@@ -13,6 +13,9 @@ Result = TypeVar("Result")
 def with_kernel(*modules: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
     """Let a function return what a kernel does on the device of its first argument, and compute only where none does.
 
+    Whoever changes the function changes its kernels, too, or removes this decorator until they follow: tests compare
+    them.
+
     Args:
         modules: of `nerf.kernels`, such as `random.cpu`. Each has a function of the same name and arguments, which
             returns None where it does not take what it is given.

@@ -45,7 +45,10 @@ class RaggedLevel(Level):
     sampler: RaggedSampler
     sampler_kind = RaggedSampler
     has_static_shapes = False
-    kernels = (LEARNING, RENDERING, "mlp.cpu", "hash_grid.cpu", "carving.cpu", "march.cpu", "random.cpu", "adam.cpu")
+    kernels = (
+        *(LEARNING, RENDERING, "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
+        *("march.cpu", "random.cpu", "table_adam.cpu"),
+    )
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__(sampler, field)

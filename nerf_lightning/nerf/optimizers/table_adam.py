@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.adam.op import adam_steps
+from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
 
 
 class TableAdam(Optimizer):

@@ -1,4 +1,7 @@
-"""The background, decided in one place: what lies behind a ray, and what a photograph shows in front of it."""
+"""The background, decided in one place: what lies behind a ray, and what a photograph shows in front of it.
+
+A rendered ray is composited over it where its sums become a `Rendering` (`from_sums`, `from_light`).
+"""
 
 from collections.abc import Callable
 

@@ -1,6 +1,6 @@
 """When checkpoints are written: `last.ckpt` every so often and at the end, `best.ckpt` at the best validation.
 
-The `last.ckpt` before stays as `previous.ckpt`.
+The `last.ckpt` before stays as `previous.ckpt` (`checkpoints/writing.py` rotates them).
 """
 
 from pathlib import Path

@@ -10,7 +10,8 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import distributed
 
-from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precision
+from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator
+from nerf_lightning.compute.precision import Precision
 from nerf_lightning.compute.ranks import processes_here
 from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
 from nerf_lightning.messages.errors import InputError

@@ -20,7 +20,7 @@ from support.running import refused
 
 from nerf_lightning.data.captures import reader as capture_reader
 from nerf_lightning.data.captures.checks import check_step
-from nerf_lightning.data.captures.pictures import pictures_below
+from nerf_lightning.data.captures.find_pictures import pictures_below
 from nerf_lightning.data.pixels.picture_files import MOST_SCANS, image_size, jpeg_scans, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader

@@ -15,7 +15,8 @@ from support.running import start_code
 from nerf_lightning.data.pixels import decoded_photographs as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
 from nerf_lightning.data.pixels.decoded_photographs import Photograph, read_photographs
-from nerf_lightning.data.pixels.picture_files import PictureHeader, area_downscale, crop_to_multiple, read_rgba
+from nerf_lightning.data.pixels.downscale import area_downscale, crop_to_multiple
+from nerf_lightning.data.pixels.picture_files import PictureHeader, read_rgba
 from nerf_lightning.files import atomic
 from nerf_lightning.files.atomic import MACHINE
 from nerf_lightning.messages.errors import InputError

@@ -8,17 +8,10 @@ from PIL import Image
 from support.budget import budget
 from support.captures import picture
 
-from nerf_lightning.data.pixels import picture_files
-from nerf_lightning.data.pixels.picture_files import (
-    area_downscale,
-    crop_to_multiple,
-    downscaled_size,
-    image_size,
-    read_header,
-    read_mask,
-    read_rgba,
-    whole_blocks,
-)
+from nerf_lightning.data.pixels import downscale, picture_files
+from nerf_lightning.data.pixels.downscale import area_downscale, crop_to_multiple, downscaled_size, whole_blocks
+from nerf_lightning.data.pixels.masks import read_mask
+from nerf_lightning.data.pixels.picture_files import image_size, read_header, read_rgba
 from nerf_lightning.messages.errors import InputError
 
 
@@ -70,7 +63,7 @@ def test_what_is_shrunk_in_parts_has_the_means_of_the_whole(monkeypatch, alpha):
     rgba = np.random.default_rng(0).integers(0, 256, (21, 12, 4), dtype=np.uint8)
     if alpha != "any":
         rgba[: 21 if alpha == "opaque" else 9, :, 3] = 255
-    monkeypatch.setattr(picture_files, "PIXELS_AT_ONCE", 100)  # two rows of blocks, and then one that is left
+    monkeypatch.setattr(downscale, "PIXELS_AT_ONCE", 100)  # two rows of blocks, and then one that is left
     assert np.array_equal(area_downscale(rgba, 3), slow_downscale(rgba, 3))
 
 

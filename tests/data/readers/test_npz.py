@@ -5,7 +5,7 @@ import pytest
 import torch
 from support.captures import npz_content, picture, pose, real_capture, write_npz
 
-from nerf_lightning.data.pixels.picture_files import area_downscale
+from nerf_lightning.data.pixels.downscale import area_downscale
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project

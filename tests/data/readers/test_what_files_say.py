@@ -23,7 +23,8 @@ from support.plain_capture import (
 )
 from support.posed_captures import photograph, write_colmap, write_transforms
 
-from nerf_lightning.data.pixels.picture_files import read_mask, read_rgba
+from nerf_lightning.data.pixels.masks import read_mask
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError

@@ -1,6 +1,6 @@
 import pytest
 
-from nerf_lightning.data.sfm.settings import chosen_matching, image_pairs, tiles_of
+from nerf_lightning.data.sfm.image_pairs import chosen_matching, image_pairs, tiles_of
 
 
 @pytest.mark.parametrize("count", [3, 12, 13, 81, 150])

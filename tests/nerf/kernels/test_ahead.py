@@ -14,7 +14,7 @@ from nerf_lightning.notebook.run import build_run
 SMALL = ("scene=bricks", "scene.resolution=16", "scene.num_train=3", "scene.num_val=1", "scene.num_test=1")
 IN_TWO = """
 from nerf_lightning.nerf.kernels.ahead import compile_ahead, to_compile
-modules = [f"nerf_lightning.nerf.kernels.{name}" for name in ("adam.cpu", "random.cpu")]
+modules = [f"nerf_lightning.nerf.kernels.{name}" for name in ("table_adam.cpu", "random.cpu")]
 print(len(to_compile(modules)), len(list(compile_ahead([*modules, "no_such.module"], 2))), len(to_compile(modules)))
 """
 
@@ -27,7 +27,7 @@ def test_a_training_takes_no_kernels_but_those_that_its_model_names(model, monke
     # In bfloat16, which few CPUs multiply, other kernels follow.
     run = build_run(*SMALL, f"model={model}", "data.batch_rays=64", "trainer.precision=32-true")
     list(run.steps(2))
-    assert {f"{KERNELS}.mlp.cpu", f"{KERNELS}.adam.cpu"} <= asked
+    assert {f"{KERNELS}.mlp.cpu", f"{KERNELS}.table_adam.cpu"} <= asked
     assert asked <= {f"{KERNELS}.{name}" for name in run.system.model.kernels()}
     assert set(run.system.model.kernels()) <= set(CPU_BACKENDS)
 

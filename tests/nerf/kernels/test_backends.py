@@ -15,7 +15,7 @@ from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.adam.op import adam_step
+from nerf_lightning.nerf.kernels.table_adam.op import adam_step
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     for _ in range(2):
         adam_step(parameter, grad.clone(), torch.zeros(3), torch.zeros(3), 0.5, 1.0, (0.0, 0.0), 1e-15)
     torch.testing.assert_close(parameter, torch.tensor([0.0, 1.0, 2.0]))
-    assert backends.why_not("nerf_lightning.nerf.kernels.adam.cpu") == "RuntimeError: LLVM cannot select this"
+    assert backends.why_not("nerf_lightning.nerf.kernels.table_adam.cpu") == "RuntimeError: LLVM cannot select this"
     assert len(caplog.records) == 1
     assert "PyTorch versions of its kernels run instead" in caplog.text
 
@@ -98,7 +98,7 @@ def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(ane
     monkeypatch.setattr(backends.importlib, "import_module", without_cache)
     with caplog.at_level(logging.WARNING):
         assert backends.backend("nerf_lightning.nerf.kernels.march.cpu") is found
-        assert backends.backend("nerf_lightning.nerf.kernels.adam.cpu") is found
+        assert backends.backend("nerf_lightning.nerf.kernels.table_adam.cpu") is found
     assert len(asked) == 3
     assert os.access(numba.config.CACHE_DIR, os.W_OK)
     assert [record.getMessage().partition(" (")[0] for record in caplog.records] == [
@@ -110,7 +110,7 @@ KEPT = """
 import logging
 logging.basicConfig()
 from nerf_lightning.nerf.kernels.backends import backend
-print(backend("nerf_lightning.nerf.kernels.adam.cpu"))
+print(backend("nerf_lightning.nerf.kernels.table_adam.cpu"))
 """
 
 

@@ -33,7 +33,7 @@ SMALL = {
     "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible", "_first"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
     "histograms.cuda": ["_sample", "_stratified", "_interlevel", "_distortion"],
-    "adam.cuda": ["_update"],
+    "table_adam.cuda": ["_update"],
     "pixels.cuda": ["_batch"],
     "rays.cuda": ["_rays"],
 }
@@ -176,7 +176,7 @@ check_against_the_reference("cpu", 140)
 cuda.PROGRAMS = 2  # so that one takes several blocks
 check_perceptron("cpu", [0, 1, 640])
 """
-QUICK = ("adam.cuda", "pixels.cuda", "rays.cuda")
+QUICK = ("table_adam.cuda", "pixels.cuda", "rays.cuda")
 
 
 @pytest.mark.parametrize(

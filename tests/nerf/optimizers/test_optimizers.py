@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.adam.op import adam_step, adam_step_torch
+from nerf_lightning.nerf.kernels.table_adam.op import adam_step, adam_step_torch
 from nerf_lightning.nerf.optimizers.schedule import Cooldown, ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 

@@ -10,7 +10,7 @@ import torch
 from support.scenes import tiny_model
 from support.static_models import fast_model
 
-from nerf_lightning.compute import devices
+from nerf_lightning.compute import devices, precision
 from nerf_lightning.compute.devices import working_device
 from nerf_lightning.config.error_messages import paragraph
 from nerf_lightning.evaluation import protocol as environment
@@ -110,8 +110,8 @@ def test_a_gpu_that_fails_ends_with_one_paragraph(kind):
 @pytest.fixture
 def slow_bfloat16(monkeypatch):
     """A CPU that multiplies bfloat16 natively, and wide matrices slower than in float32."""
-    monkeypatch.setattr(devices, "cpu_multiplies_bfloat16", lambda: True)
-    monkeypatch.setattr(devices, "cpu_gains_by_bfloat16", lambda: False)
+    monkeypatch.setattr(precision, "cpu_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(precision, "cpu_gains_by_bfloat16", lambda: False)
 
 
 def products_of(model):
@@ -162,7 +162,7 @@ def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
-    asked = ("bf16-mixed", "as when the run started") if begun else devices.choose_precision("bf16-mixed", "cuda")
-    assert devices.suited(*asked, "cuda", tiny_model())[0] == used
+    asked = ("bf16-mixed", "as when the run started") if begun else precision.choose_precision("bf16-mixed", "cuda")
+    assert precision.suited(*asked, "cuda", tiny_model())[0] == used
     said = ["trainer.precision=bf16-mixed: this device has no native bfloat16, so float32 is used instead."]
     assert caplog.messages == ([] if native or begun else said)

@@ -7,7 +7,7 @@ from support.configs import composed
 from support.static_models import MODELS, fast_model
 
 from nerf_lightning.compute import xla_device
-from nerf_lightning.compute.devices import choose_precision
+from nerf_lightning.compute.precision import choose_precision
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.training.launch import xla

@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
+from nerf_lightning.data.captures.find_pictures import find_pictures, pictures_below
 from nerf_lightning.data.pixels.decoded_photographs import of_one_shape
-from nerf_lightning.data.pixels.picture_files import image_size, read_header, read_mask
+from nerf_lightning.data.pixels.masks import read_mask
+from nerf_lightning.data.pixels.picture_files import image_size, read_header
 from nerf_lightning.files.regular import contents
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from functools import cache, cached_property
 from typing import NamedTuple
 
-from nerf_lightning.config.manual.docstrings import Constructor, constructor
-from nerf_lightning.config.manual.yaml_comments import CommentedYaml, Entry, read_commented
+from nerf_lightning.config.help.docstrings import Constructor, constructor
+from nerf_lightning.config.help.yaml_comments import CommentedYaml, Entry, read_commented
 from nerf_lightning.files.folders import conf_file, option_names
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")

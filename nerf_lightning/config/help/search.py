@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator, Sequence
 from textwrap import TextWrapper
 
-from nerf_lightning.config.manual.catalogue import Command
-from nerf_lightning.config.manual.pages import brief, row
+from nerf_lightning.config.help.catalogue import Command
+from nerf_lightning.config.help.pages import brief, row
 from nerf_lightning.files.folders import conf_folder
 
 MOST = 20

@@ -45,11 +45,11 @@ def adam_steps(
     numbers, device = (step_size, root_scale, betas, eps), parameters[0][0].device
     rows = [(row[0].detach(), *row[1:]) for row in parameters]
     suits = [all(x.is_contiguous() and x.dtype == torch.float32 for x in row) for row in rows]
-    cuda = cuda_backend("adam.cuda", device) if all(suits) else None
+    cuda = cuda_backend("table_adam.cuda", device) if all(suits) else None
     if cuda is not None:
         cuda.adam_steps(rows, *numbers)
         return
-    cpu = cpu_backend("adam.cpu", device)
+    cpu = cpu_backend("table_adam.cpu", device)
     for row, suitable in zip(rows, suits, strict=True):
         (cpu.adam_step if cpu is not None and suitable else adam_step_torch)(*row, *numbers)
 

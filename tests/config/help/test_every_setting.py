@@ -7,10 +7,10 @@ from hydra.utils import get_object
 from support.configs import composed, groups, yaml_files
 
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.config.manual.catalogue import command_named
-from nerf_lightning.config.manual.docstrings import constructor
-from nerf_lightning.config.manual.pages import brief, command_page, page_of
-from nerf_lightning.config.manual.yaml_comments import read_commented
+from nerf_lightning.config.help.catalogue import command_named
+from nerf_lightning.config.help.docstrings import constructor
+from nerf_lightning.config.help.pages import brief, command_page, page_of
+from nerf_lightning.config.help.yaml_comments import read_commented
 from nerf_lightning.config.overrides import flatten
 from nerf_lightning.files.folders import option_names
 

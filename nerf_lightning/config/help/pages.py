@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator
 from textwrap import fill
 
-from nerf_lightning.config.manual.catalogue import Command, Option, Setting
-from nerf_lightning.config.manual.suggestions import did_you_mean
+from nerf_lightning.config.help.catalogue import Command, Option, Setting
+from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 COLUMN = 34  # Where the sentences of a list begin

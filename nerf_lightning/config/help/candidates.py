@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Iterator
 from glob import escape, glob
 
-from nerf_lightning.config.manual.catalogue import Command, command_named
+from nerf_lightning.config.help.catalogue import Command, command_named
 from nerf_lightning.files.folders import option_names
 
 SHELLS = ("bash", "zsh", "fish")
