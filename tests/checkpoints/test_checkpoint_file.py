@@ -66,6 +66,7 @@ def test_whatever_fails_the_former_one_is_there(tmp_path, monkeypatch, function)
         assert steps(tmp_path) == {"last.ckpt": 3, "previous.ckpt": 2}
 
 
+@pytest.mark.minutes
 @POSIX
 def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
     """A real limit on the size of files, in a process of its own."""

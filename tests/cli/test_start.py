@@ -42,6 +42,7 @@ def test_training_imports_nothing_heavy_beside_lightnings_own():
     assert output.splitlines()[-1] == "[]"
 
 
+@pytest.mark.minutes
 def test_the_collector_rests_while_lightning_is_loaded_and_scipys_signals_wait_for_who_asks(tmp_path_factory):
     during, loaded, after, *_, asked = cold_import(tmp_path_factory)
     assert (during, after) == ("False", "True True")

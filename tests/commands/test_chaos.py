@@ -118,7 +118,7 @@ def never_killed(phase, places, out):
     return content(phase, out), float(out.with_name(f"{out.name}.seconds").read_text())
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("name", QUICK)
 @POSIX
 def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(name, places, tmp_path):
@@ -176,7 +176,7 @@ def once_saved(process, folder):
     time.sleep(random.uniform(0, 0.2))
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("logger", ["tensorboard", pytest.param("none", marks=pytest.mark.exhaustive)])
 @POSIX
 def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, tmp_path):

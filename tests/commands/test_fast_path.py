@@ -32,7 +32,7 @@ def flat(value, path=""):
         yield path, value
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @POSIX
 def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads):

@@ -69,7 +69,7 @@ def assert_the_same_end(plans, capture, folder, never_killed):
     return killed
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, never_killed):
     assert_the_same_end(moments(4), capture, tmp_path / "run", never_killed)
 

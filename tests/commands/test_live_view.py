@@ -43,7 +43,7 @@ def address_in(process):
     raise AssertionError("it never said where the page is")
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
     steps = "trainer.max_steps=160"  # Long enough for two people who come and go.
     alone = run(capture, tmp_path / "alone", steps)

@@ -317,6 +317,7 @@ def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_p
 def test_a_garbled_note_is_damaged(nerf, capture, run):
     (run / "run.json").write_text('{"fingerprint": ' + "[" * 10_000)
     leave("run", run, "scene=npz", f"scene.path={capture}", *FAST)
+    nerf("train", f"resume={run}")  # which may say that it caches the pictures
     said(nerf("train", f"resume={run}"), f"{run / 'run.json'} is damaged", "Remove it")
 
 

@@ -50,7 +50,7 @@ def alone(capture, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_two_processes_follow_one(capture, tmp_path, alone):
     """Uneven shares of 101 rays, random backgrounds; views of the evaluation and frames of the film are dealt out."""
     code, output = finished(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))

@@ -40,6 +40,7 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert 'http-equiv="Content-Security-Policy" content="default-src &#x27;none&#x27;' in text
 
 
+@pytest.mark.minutes
 def test_sliders_work_videos_play_and_it_fits_a_phone(page_of_run):
     with opened(page_of_run[0].as_uri(), 1200, 900) as driver:
         run = driver.execute_script

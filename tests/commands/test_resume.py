@@ -184,7 +184,7 @@ def test_submitits_own_handler_is_called_after_the_run_has_saved(monkeypatch):
     assert called == [signal.SIGUSR2]
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @POSIX
 def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_again(capture, tmp_path, scontrol):
     root = tmp_path / "runs"

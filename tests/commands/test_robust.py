@@ -38,6 +38,7 @@ def test_it_weighs_the_loss_of_each_model(model, of):
     assert type(loss.of) is of
 
 
+@pytest.mark.minutes
 def test_a_run_that_goes_on_ends_with_the_same_bits(nerf, capture, run, tmp_path):
     folder = tmp_path / "run"
     for steps in (10, 20):

@@ -92,7 +92,7 @@ def test_jobs_side_by_side_have_the_cores_that_slurm_gave(monkeypatch):
     assert os.environ["LOKY_MAX_CPU_COUNT"] == "1"
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_search_maximises_the_psnr_and_goes_on_where_it_was(capture, tmp_path):
     search = ("hydra/sweeper=search", "optimizer.lr=tag(log, interval(1e-4, 1e-2))")
     code, output = run(*arguments(capture, tmp_path, *search, "hydra.sweeper.n_trials=2"))
@@ -121,7 +121,7 @@ def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
     assert [(row["data.batch_rays"], row["state"]) for row in table(tmp_path)] == [("64", "finished"), ("-1", "failed")]
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @POSIX
 def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     longer = ("seed=0,1", "trainer.max_steps=50")

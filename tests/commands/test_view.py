@@ -102,7 +102,7 @@ def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
         again.bind(("127.0.0.1", served.port))
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page):
     with opened(page.address) as browser:
         first = wait_until(browser, lambda picture: picture.std() > 10)

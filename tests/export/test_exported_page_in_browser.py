@@ -19,7 +19,7 @@ from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.shots import Subject, lay_path, make_shots
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.minutes
 
 WITHOUT = "HTMLCanvasElement.prototype.getContext = () => null;"
 

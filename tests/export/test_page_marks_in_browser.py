@@ -13,7 +13,7 @@ from support.shiny_ball import RADIUS, all_around, beside, read_page, record_of,
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.nerf.geometry.world_frame import similarity
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.minutes
 
 EVIL = '<img src=x onerror="document.title=1">'
 MOTION = {"features": [{"name": "prefers-reduced-motion", "value": "no-preference"}]}

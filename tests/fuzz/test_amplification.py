@@ -141,6 +141,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.minutes
 @pytest.mark.skipif(sys.platform != "linux", reason="the address space is read from /proc")
 def test_files_that_claim_more_than_they_hold(tmp_path):
     files = []

@@ -5,7 +5,7 @@ from support.browser import opened
 
 from nerf_lightning.commands.table import write_table_page
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.minutes
 
 ROWS = [
     {"scene": "lego", "model": "fast", "PSNR": 31.3, "minutes": 2.0, "source": None},

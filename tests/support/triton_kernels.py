@@ -46,7 +46,7 @@ def check_random(kernels, device, generator, rays):
         assert torch.equal(kernels.uniform(random.key, random.slots, purpose_word("strata"), count), expected)
 
 
-def check_adam(kernels, device, generator, rays):
+def check_table_adam(kernels, device, generator, rays):
     """Of several parameters at once; where the gradient is zero nothing changes; NaN counts as touched."""
     found = []
     for count in (1300, 1, 0, 1024):

@@ -9,7 +9,7 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 from support.served_page import served
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.minutes
 
 # Half the height of the photographs is 0.3125 of their focal length.
 PHOTOGRAPH = 2 * math.atan(0.3125)
