@@ -58,13 +58,13 @@ $(VENV)/.usable: pyproject.toml constraints/torch.txt
 train: $(VENV)/.usable ## Train the built-in scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
-test: setup ## Run the tests, but for the exhaustive ones: 6 to 16 minutes on two cores
+test: setup ## Run the tests that are neither exhaustive nor take minutes: 5 to 7 minutes on two cores
 	@$(PYTEST)
 
 test-all: setup ## Run every test, the exhaustive ones included
 	@$(PYTEST) -m ""
 
-test-slow: setup ## Run the tests that take minutes together: kernels compiled for GPUs that are not here, models on a stand-in
+test-slow: setup ## Run the tests that take minutes: browsers, killed runs, kernels compiled for other machines, models on a stand-in
 	@$(PYTEST) -m minutes
 
 test-fast: setup ## Run the tests that take less than a few seconds each
