@@ -45,7 +45,9 @@ def checked(given: Any = None, *, typechecker: Any = None) -> Any:
 def _function(function: Any, typechecker: Any) -> Any:
     if not isinstance(function, types.FunctionType):
         return slowly_checked(function, typechecker=typechecker)
-    if not function.__annotations__ or getattr(function, "__no_type_check__", False):
+    hints = function.__annotations__.values()
+    # Of a kernel nothing is checked, and triton 3.6 reads its source with the names of what is around it.
+    if getattr(function, "__no_type_check__", False) or all(_is_tritons(hint) for hint in hints):
         return function
     prepared: list[Callable] = []
 
@@ -56,6 +58,10 @@ def _function(function: Any, typechecker: Any) -> Any:
         return prepared[0](*arguments, **named)
 
     return call
+
+
+def _is_tritons(hint: Any) -> bool:
+    return getattr(hint, "__module__", "").startswith("triton.")
 
 
 def _is_inner(function: types.FunctionType) -> bool:

@@ -18,7 +18,7 @@ from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.export.splats.rasterizer import rasterize
 from nerf_lightning.export.splats.views import View, color_behind
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
-from nerf_lightning.nerf.kernels.table_adam.op import adam_step
+from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.types.scene import DRAWN, Background
 
@@ -113,7 +113,7 @@ class _State:
             assert tensor.grad is not None
             first, second = getattr(self.first, name), getattr(self.second, name)
             step_size = rate * self.rates[name] / (1 - b1**self.step)
-            adam_step(tensor.detach(), tensor.grad, first, second, step_size, root_scale, BETAS, EPS)
+            adam_steps([(tensor, tensor.grad, first, second)], step_size, root_scale, BETAS, EPS)
             tensor.grad = None
         self.gaussians.log_scales.detach().clamp_(min=self.finest[:, None])
         return float(loss.detach())

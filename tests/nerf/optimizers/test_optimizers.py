@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.table_adam.op import adam_step, adam_step_torch
+from nerf_lightning.nerf.kernels.table_adam.op import adam_step_torch, adam_steps
 from nerf_lightning.nerf.optimizers.schedule import Cooldown, ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 
@@ -48,12 +48,11 @@ def test_entries_without_a_gradient_stay_where_they_are():
 def test_the_numba_twin_equals_the_reference():
     given = [torch.randn(5003) for _ in range(3)] + [torch.rand(5003)]
     given[1][::3] = 0
-    results = []
-    for fn, dtype in ((adam_step, torch.float32), (adam_step_torch, torch.float64)):
-        arrays = [x.clone().to(dtype) for x in given]
-        fn(*arrays, 0.01, 1.3, (0.9, 0.99), 1e-15)
-        results.append(arrays)
-    for found, expected in zip(*results, strict=True):
+    numbers = 0.01, 1.3, (0.9, 0.99), 1e-15
+    found_by_numba, reference = [x.clone() for x in given], [x.double() for x in given]
+    adam_steps([tuple(found_by_numba)], *numbers)
+    adam_step_torch(*reference, *numbers)
+    for found, expected in zip(found_by_numba, reference, strict=True):
         torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
 
 
