@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from nerf_lightning.evaluation.metrics import (
     SSIM_WINDOW,
@@ -43,6 +44,14 @@ def test_ssim_falls_with_noise():
     noise = torch.randn(32, 32, 3)
     scores = [image_metrics(truth + level * noise, truth)["ssim"] for level in (0.02, 0.1, 0.3)]
     assert 1.0 > scores[0] > scores[1] > scores[2] > 0.0
+
+
+def test_ssim_has_the_window_of_its_paper():
+    """A Gaussian of 1.5 pixels over 11 x 11 of them (Wang et al. 2004)."""
+    render, truth = torch.rand(2, 32, 27, 3)
+    planes = (picture.movedim(-1, 0)[None] for picture in (render, truth))
+    wanted = structural_similarity_index_measure(*planes, sigma=1.5, kernel_size=11, data_range=1.0)
+    assert math.isclose(image_metrics(render, truth)["ssim"], float(wanted), abs_tol=1e-6)
 
 
 def test_an_image_smaller_than_the_window_has_no_ssim_and_without_pixels_no_psnr():
