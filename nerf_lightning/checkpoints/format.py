@@ -8,10 +8,11 @@ from jaxtyping import Float64, Int, jaxtyped
 from packaging.version import Version
 from torch import Tensor
 
+from nerf_lightning import __version__
 from nerf_lightning.checkpoints.quantization import Quantized
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import check_cameras, check_scene
-from nerf_lightning.files.trust import Mismatch, require_fit
+from nerf_lightning.files.trust import Mismatch, require_fit, shown
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.progress import Progress
@@ -62,6 +63,26 @@ OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": obj
 """What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
 OF_AVERAGING: dict[str, Any] = {"current_model_state": dict[str, Tensor], "averaging_state": dict[str, Tensor]}
 """What Lightning's WeightAveraging adds and restores; `state_dict` has the averages then."""
+
+
+def require_our_format(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse a file that is no checkpoint of this program, or one of another format.
+
+    Raises:
+        InputError: in either case.
+    """
+    record = content.get(KEY)
+    if not isinstance(record, dict) or "state_dict" not in content:
+        raise InputError(
+            f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
+            "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
+        )
+    written, version = record.get("format"), shown(record.get("version")).strip("'")
+    if type(written) is not int or written != FORMAT:
+        raise InputError(
+            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
+            f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
+        )
 
 
 def require_checkpoint(content: dict[str, Any], where: str) -> None:

@@ -18,12 +18,12 @@ from typing import Any
 from torch import Tensor, nn
 
 from nerf_lightning import __version__
-from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, scene_of
+from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, require_our_format, scene_of
 from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.files.trust import Mismatch, reading, require_fit, shown
+from nerf_lightning.files.trust import Mismatch, reading, require_fit
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
@@ -161,18 +161,7 @@ def read_content(path: Path) -> dict[str, Any]:
         InputError: as `read_checkpoint`.
     """
     content = _load(path)
-    record = content.get(KEY)
-    if not isinstance(record, dict) or "state_dict" not in content:
-        raise InputError(
-            f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
-            "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
-        )
-    written, version = record.get("format"), shown(record.get("version")).strip("'")
-    if type(written) is not int or written != FORMAT:
-        raise InputError(
-            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
-            f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
-        )
+    require_our_format(content, path)
     with reading(path, _instead_of(path)):
         require_checkpoint(content, str(path))
     return content

@@ -22,7 +22,7 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
-from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
 
 STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red", "not judged": "dim"}

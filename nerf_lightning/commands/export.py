@@ -25,7 +25,7 @@ from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
-from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.results import scene_name
 from nerf_lightning.runs.summary import read_note, read_run
 from nerf_lightning.training.launch.processes import on_all_processes

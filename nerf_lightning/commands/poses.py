@@ -17,7 +17,7 @@ from nerf_lightning.data.sfm.summary import summary_lines
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_positive
-from nerf_lightning.runs.folder import job_folder
+from nerf_lightning.runs.run_folder import job_folder
 from nerf_lightning.video.encoding import require_ffmpeg
 
 

@@ -13,7 +13,7 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say_written
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
-from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.film import film
 from nerf_lightning.video.settings import as_list, film_settings

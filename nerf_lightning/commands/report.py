@@ -14,7 +14,7 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
-from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.results import FILES
 
 

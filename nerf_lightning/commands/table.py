@@ -9,7 +9,7 @@ from nerf_lightning.files.folders import PACKAGE
 from nerf_lightning.files.html import write_page
 from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError, require_one_of
-from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
 from nerf_lightning.runs.table import ORDERS, result_table
 from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns, write_csv, write_markdown

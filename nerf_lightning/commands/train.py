@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.commands.train_job.build import build_job
 from nerf_lightning.commands.train_job.fit import fit
-from nerf_lightning.commands.train_job.run_folder import held_folder
+from nerf_lightning.commands.train_job.held_folder import held_folder
 from nerf_lightning.commands.train_job.show import show
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.launch.preemption import preemptible

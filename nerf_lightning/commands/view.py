@@ -8,7 +8,7 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
-from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
+from nerf_lightning.runs.command_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.guarded_server import Auth
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import tunnel

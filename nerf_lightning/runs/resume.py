@@ -1,4 +1,7 @@
-"""Which run a command resumes, and whether it is a run with these settings."""
+"""Which run a command resumes, and whether it is a run with these settings.
+
+Which of its checkpoints, `checkpoints.reading.newest_checkpoint` says.
+"""
 
 import logging
 from collections.abc import Mapping

@@ -10,7 +10,8 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, CUDA_BACKENDS
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.op import march

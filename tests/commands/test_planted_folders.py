@@ -16,8 +16,8 @@ from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import saved_overrides
-from nerf_lightning.runs.folder import RunFolder, open_run
 from nerf_lightning.runs.resume import _former_identity, newest_unfinished
+from nerf_lightning.runs.run_folder import RunFolder, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep, to_give_again
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.runs.sweep import Sweep

@@ -14,8 +14,8 @@ from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.config.setting_rules import fingerprint
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
 from nerf_lightning.runs.identity import run_identity, settings_digest
+from nerf_lightning.runs.run_folder import ResumePoint, open_run, write_config
 
 HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}
 

@@ -174,7 +174,7 @@ KINDS = {
 @pytest.fixture(autouse=True)
 def _no_sweep(monkeypatch):
     """What these commands ask Hydra for beside the config."""
-    monkeypatch.setattr("nerf_lightning.runs.output_folder.job_folder", lambda: None)
+    monkeypatch.setattr("nerf_lightning.runs.command_folder.job_folder", lambda: None)
 
 
 def damage(draw, path):

@@ -6,7 +6,8 @@ from support.triton_perceptron import check_perceptron
 from support.triton_twin import check_against_the_reference
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.selftest import kernels
 from nerf_lightning.selftest.check import carried_out
 

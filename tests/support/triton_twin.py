@@ -2,7 +2,7 @@
 
 import torch
 
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 
 

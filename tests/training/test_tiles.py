@@ -9,10 +9,11 @@ from support.static_models import fast_model
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.kernels.hash_grid.op import add_all, defer_table_grads, hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel, average_counts
 from nerf_lightning.nerf.part import fit_parts, sample_counts
-from nerf_lightning.training.tile_size import fastest
+from nerf_lightning.training.fastest_tile import fastest
 
 MODELS = {"nerf": lambda: tiny_model(density_bias=0.5), "fast": lambda: fast_model(RaggedLevel)}
 

@@ -20,8 +20,8 @@ from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
-from nerf_lightning.runs.folder import job_folder
 from nerf_lightning.runs.resume import former_config
+from nerf_lightning.runs.run_folder import job_folder
 from nerf_lightning.runs.sweep_job import stop_file
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard

@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.train_job.build import TrainJob, searchpath_override
+from nerf_lightning.commands.train_job.held_folder import HeldFolder
 from nerf_lightning.commands.train_job.memory_plan import announce_memory
-from nerf_lightning.commands.train_job.run_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.overrides import to_type
@@ -20,7 +20,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.tiles import is_device_failure
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
-from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
+from nerf_lightning.training.fastest_tile import SHORT_RUN, measured_tile
 
 LONG = 3600.0
 """Seconds of training after which a person is told of a shorter way before it starts."""

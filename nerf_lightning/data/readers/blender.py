@@ -15,7 +15,7 @@ from nerf_lightning.data.captures.scene import Coordinates
 from nerf_lightning.data.captures.splits import apart
 from nerf_lightning.data.pixels.decoded_photographs import upright_size
 from nerf_lightning.data.pixels.picture_files import ENDINGS
-from nerf_lightning.data.readers.frames import FrameFile, say_of_files, views_of
+from nerf_lightning.data.readers.json_frames import FrameFile, say_of_files, views_of
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Background

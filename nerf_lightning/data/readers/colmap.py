@@ -1,7 +1,6 @@
 """COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, beside a folder of photographs."""
 
 import logging
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -24,41 +23,15 @@ from nerf_lightning.data.captures.find_pictures import (
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
-from nerf_lightning.data.readers.colmap_files import (
-    CURE,
-    BinaryFiles,
-    ColmapCamera,
-    ColmapImage,
-    ColmapPoints,
-    TextFiles,
-)
+from nerf_lightning.data.readers.colmap_cameras import ColmapCamera, intrinsics_of, lens_of
+from nerf_lightning.data.readers.colmap_files import CURE, BinaryFiles, ColmapImage, ColmapPoints, TextFiles
 from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, rotation_from_quaternion
-from nerf_lightning.nerf.types.scene import LensModel
 
-# Which of its parameters are fx, fy, cx, cy, and which k1, k2, k3, k4, p1, p2; -1: none.
-NONE = (-1, -1, -1, -1, -1, -1)
-LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": ("pinhole", (0, 0, 1, 2), NONE),
-    "PINHOLE": ("pinhole", (0, 1, 2, 3), NONE),
-    "SIMPLE_RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
-    "RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
-    "OPENCV": ("radial_tangential", (0, 1, 2, 3), (4, 5, -1, -1, 6, 7)),
-    "OPENCV_FISHEYE": ("fisheye", (0, 1, 2, 3), (4, 5, 6, 7, -1, -1)),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
-    "RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
-    "SIMPLE_FISHEYE": ("fisheye", (0, 0, 1, 2), NONE),
-    "FISHEYE": ("fisheye", (0, 1, 2, 3), NONE),
-    "FULL_OPENCV": ("radial_tangential", (0, 1, 2, 3), (4, 5, 8, -1, 6, 7)),
-    "THIN_PRISM_FISHEYE": ("fisheye", (0, 1, 2, 3), (4, 5, 8, 9, -1, -1)),
-    "EQUIRECTANGULAR": ("equirectangular", (0, 1, 0, 1), NONE),
-}
-ONLY_WITHOUT = {"FULL_OPENCV": (9, 10, 11), "THIN_PRISM_FISHEYE": (6, 7, 10, 11)}
-"""Parameters that must be 0 where a model is read as one of ours: rational, tangential and thin-prism terms."""
 MODEL_FOLDERS = ("sparse", "", "colmap/sparse", "colmap", "colmap_text", "distorted/sparse")
 """Where models lie below a capture's folder, or in folders of these, the likeliest first."""
 FILES = ("cameras", "images", "points3D")
@@ -111,7 +84,7 @@ class ColmapReader(CaptureReader):
         usual = [where] if self.images else [root / name for name in (*_beside(folder, root), *PICTURE_FOLDERS)]
         pictures = next((place for place in usual if os.path.isdir(place)), where)
         files = find_pictures(names, pictures, where, folder, self.allow_outside)
-        views, kept = [], []
+        views, kept, lenses = [], [], []
         for image in model.images:
             with left_out.unless_usable(image.name):
                 if image.name not in files:
@@ -121,11 +94,11 @@ class ColmapReader(CaptureReader):
                     raise InputError(
                         f"{folder}: {image.name} names a camera that does not exist: {image.camera}. {CURE}"
                     )
-                _require_known(camera, folder)
+                lens = lens_of(camera, folder)
                 views.append(_view(image, camera, files[image.name]))
                 kept.append(image)
+                lenses.append(lens)
         left_out.require_enough(len(views))
-        lenses = [LAYOUTS[model.cameras[image.camera].model][0] for image in kept]
         taken = set(files.values())
         base = os.path.commonpath([path.parent for path in taken])
         others = [path for path in pictures_below(Path(base)) if path not in taken] if self._own(base) else []
@@ -165,19 +138,15 @@ class ColmapReader(CaptureReader):
 
 
 def _view(image: ColmapImage, camera: ColmapCamera, path: Path) -> View:
-    _, pinhole, lens = LAYOUTS[camera.model]
-    fx, fy, cx, cy = (camera.params[place] for place in pinhole)
-    k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
-    if camera.model == "EQUIRECTANGULAR":  # its parameters are its size; pixels per radian
-        fx, fy, cx, cy = fx / (2 * math.pi), fy / math.pi, fx / 2, fy / 2
+    focal, center, lens = intrinsics_of(camera)
     return View(
         name=image.name,
         photograph=Photograph(path),
         c2w=_c2w(image),
-        focal=(fx, fy),
-        center=(cx, cy),
+        focal=focal,
+        center=center,
         size=(float(camera.width), float(camera.height)),
-        lens=(k1, k2, k3, k4, p1, p2),
+        lens=lens,
     )
 
 
@@ -204,19 +173,6 @@ def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
     translation = torch.tensor(image.translation, dtype=torch.float64)
     center = -rotation.mT @ translation
     return flip_yz(torch.cat([rotation.mT, center[:, None]], dim=-1))
-
-
-def _require_known(camera: ColmapCamera, folder: Path) -> None:
-    """Refuse a lens that ours are not, and one that ours are only without some of its terms."""
-    unknown = [camera.params[place] for place in ONLY_WITHOUT.get(camera.model, ())]
-    if camera.model in LAYOUTS and not any(unknown):
-        return
-    terms = " with terms that ours do not have" if camera.model in LAYOUTS else ""
-    raise InputError(
-        f"{folder} uses the camera model {camera.model}{terms}, whose lens is not supported; supported "
-        f"are {listed(LAYOUTS, len(LAYOUTS))}. Undistort the photographs with `colmap image_undistorter`, or "
-        "reconstruct with OPENCV (or OPENCV_FISHEYE)."
-    )
 
 
 def models_in(root: Path) -> dict[Path, int]:

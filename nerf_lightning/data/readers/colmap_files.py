@@ -19,33 +19,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from nerf_lightning.data.readers.colmap_cameras import BY_NUMBER, CAMERA_MODELS, ColmapCamera
 from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import encoding_of, open_regular, read_lines
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 
-MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4),
-    13: ("DIVISION", 5),
-    14: ("SIMPLE_FISHEYE", 3),
-    15: ("FISHEYE", 4),
-    16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
-}
-"""COLMAP's numbers of camera models, with their names and counts of parameters."""
-COUNTS = dict(MODELS.values())
 WINDOWS = "cp1252"
 LONGEST_NAME = 1 << 14
 """In bytes."""
@@ -55,17 +34,6 @@ CURE = "Copy the model again, or run the reconstruction again (nerf poses images
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ColmapCamera:
-    """One camera's intrinsics."""
-
-    number: int
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -105,10 +73,10 @@ class BinaryFiles:
         data = _Bytes(path)
         for _ in range(data.count(24, "views")):
             number, model, width, height = data.take("<IiQQ")
-            if model not in MODELS:
+            if model not in BY_NUMBER:
                 raise InputError(f"{path} holds a camera of the unknown model number {model}. {CURE_MODEL}")
-            name, count = MODELS[model]
-            yield ColmapCamera(number, name, width, height, data.take(f"<{count}d"))
+            name = BY_NUMBER[model]
+            yield ColmapCamera(number, name, width, height, data.take(f"<{CAMERA_MODELS[name].num_params}d"))
         data.end()
 
     def images(self, path: Path) -> Iterator[ColmapImage]:
@@ -202,10 +170,10 @@ class TextFiles:
             with reading(where, CURE):
                 number, model, width, height, *params = line.split()
                 model = model.upper()
-                if model not in COUNTS:
+                if model not in CAMERA_MODELS:
                     raise InputError(f"{where} holds a camera of the unknown model {model!r}. {CURE_MODEL}")
-                if len(params) != COUNTS[model]:
-                    raise ValueError(f"{model} has {COUNTS[model]} parameters, not {len(params)}")
+                if len(params) != (count := CAMERA_MODELS[model].num_params):
+                    raise ValueError(f"{model} has {count} parameters, not {len(params)}")
                 sides = int(float(width)), int(float(height))
                 yield ColmapCamera(int(number), model, *sides, tuple(map(float, params)))
 

@@ -16,7 +16,7 @@ from nerf_lightning.data.captures.find_pictures import find_pictures, pictures_b
 from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.readers.frames import (
+from nerf_lightning.data.readers.json_frames import (
     FoundFrame,
     FrameFile,
     length_of,

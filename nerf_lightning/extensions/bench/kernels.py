@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import can_compile
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.mlp.op import mlp, mlp_torch
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, cpu_multiplies_bfloat16

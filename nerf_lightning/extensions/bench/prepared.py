@@ -24,9 +24,9 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.build_step import build_step
+from nerf_lightning.training.fastest_tile import measured_tile
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
-from nerf_lightning.training.tile_size import measured_tile
 
 # Without these, torch computes around the kernels of hash grids, random numbers and histograms.
 TWINS = (

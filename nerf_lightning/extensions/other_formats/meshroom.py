@@ -8,7 +8,7 @@ import torch
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import pose_from_matrix
-from nerf_lightning.data.readers.frames import path_of
+from nerf_lightning.data.readers.json_frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.readers.frames import path_of
+from nerf_lightning.data.readers.json_frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

@@ -10,7 +10,7 @@ from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header
-from nerf_lightning.data.readers.frames import number_of
+from nerf_lightning.data.readers.json_frames import number_of
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.readers.frames import path_of
+from nerf_lightning.data.readers.json_frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
     Format,
     Intrinsics,

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.find_pictures import first_with_pictures, pictures_below
-from nerf_lightning.data.readers.frames import path_of
+from nerf_lightning.data.readers.json_frames import path_of
 from nerf_lightning.extensions.other_formats.posed import (
     FOLDERS,
     Format,

@@ -16,7 +16,7 @@ from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.output_folder import beside_checkpoint
+from nerf_lightning.runs.command_folder import beside_checkpoint
 from nerf_lightning.runs.saved_overrides import former_overrides
 
 

@@ -11,7 +11,7 @@ from nerf_lightning.extensions.pruning.quantize import NumberType, quantize_rows
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
-from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.level import Level

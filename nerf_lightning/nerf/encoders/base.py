@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.part import Part
 

@@ -10,7 +10,8 @@ from torch.nn import functional
 
 from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout, hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.ranges import require_ranges
 

@@ -45,7 +45,7 @@ class OccupancySampler(RaggedSampler):
     """Keep a moving average of the density in each cell, and sample only where it is high enough.
 
     Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
-    the new one, and is occupied above the smaller of the mean and the density that makes one interval `min_alpha`
+    the new one, and is occupied above the smaller of half the mean and the density that makes one interval `min_alpha`
     opaque. Cells that no training view sees, and those through which a photograph's alpha shows nothing, are
     empty from the start.
 
@@ -248,8 +248,7 @@ class OccupancySampler(RaggedSampler):
             number = number[(step // self.update_every) % 2 :: 2]
         grid.update(density, number, key, self.decay)
         if step >= self.prune_after:
-            mean = grid.density.sum() / grid.possible.sum()
-            grid.occupy((grid.density > (0.5 * mean).clamp(max=self._least_density)) & grid.possible)
+            grid.prune(self._least_density)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)

@@ -82,6 +82,11 @@ class OccupancyGrid(Part):
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
             kept[cells] = torch.maximum(decay * kept[cells], density(self.positions(cells, part)).float())
 
+    def prune(self, least_density: float) -> None:
+        """Leave occupied what is denser than half the mean of the possible cells, or than `least_density`."""
+        mean = self.density.sum() / self.possible.sum()
+        self.occupy((self.density > (0.5 * mean).clamp(max=least_density)) & self.possible)
+
     def occupy(self, occupied: Tensor) -> None:
         """Say which cells rays may not pass over."""
         self.cells.copy_(occupied)

@@ -5,7 +5,8 @@ import torch
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid import cpu
-from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout, hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 
 LAYOUTS = [

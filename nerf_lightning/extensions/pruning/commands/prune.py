@@ -22,7 +22,7 @@ from nerf_lightning.extensions.pruning.quantized_weights import quantized_weight
 from nerf_lightning.files.made_folders import child_of, make_folder
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 
 KEPT = ("format", "choices", "scene", "refined", "precision", "tile_points")
 """What of a checkpoint's record does not depend on widths or on a run that is going on."""

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
@@ -15,11 +15,9 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
-
-if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
 
 POINTS = 64
 """So many are taken at a time: their cells are found by vectors, and then what stands there is fetched. Found one by
@@ -37,7 +35,7 @@ NONE, NEXT = np.int32(0), np.int32(1)
 
 
 def forward(
-    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
+    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: HashGridLayout
 ) -> Float[Tensor, "points out"]:
     """Return the features."""
     lanes = (0,) * table.shape[1]
@@ -50,14 +48,14 @@ def add_table_gradient(
     into: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
     grad: Float[Tensor, "points out"],
-    layout: "HashGridLayout",
+    layout: HashGridLayout,
 ) -> None:
     """Add the gradient with respect to the table to `into`."""
     add_table_gradients(into, [(points, grad)], layout)
 
 
 def add_table_gradients(
-    into: Float[Tensor, "entries features"], found: Sequence[tuple[Tensor, Tensor]], layout: "HashGridLayout"
+    into: Float[Tensor, "entries features"], found: Sequence[tuple[Tensor, Tensor]], layout: HashGridLayout
 ) -> None:
     """Add several gradients with respect to the table, one after the other.
 
@@ -81,7 +79,7 @@ def point_gradient(
     table: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
     grad: Float[Tensor, "points out"],
-    layout: "HashGridLayout",
+    layout: HashGridLayout,
 ) -> Float[Tensor, "points 3"]:
     """Return the gradient with respect to the points."""
     out = torch.empty_like(points)
@@ -93,8 +91,6 @@ def point_gradient(
 
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
-
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3)
     table, grad = torch.zeros(layout.offsets[-1], FEATURES), torch.ones(4, 2 * FEATURES)
     forward(table, points, layout)
@@ -102,7 +98,7 @@ def trial() -> None:
     point_gradient(table, points, grad, layout)
 
 
-def level_arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
+def level_arrays(layout: HashGridLayout) -> tuple[Any, ...]:
     """Return what the kernels take of a layout."""
     resolutions = np.array(layout.resolutions, np.int32)
     hashed = np.array([layout.is_hashed(level) for level in range(len(resolutions))])

@@ -4,7 +4,7 @@ Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
 import functools
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
@@ -12,11 +12,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.padding import end_of_rows
-
-if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
 
 BLOCK = 128
 
@@ -24,7 +22,7 @@ BLOCK = 128
 def forward(
     table: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
-    layout: "HashGridLayout",
+    layout: HashGridLayout,
     used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
     """Return the features; zeros from point `used` on, up to a block."""
@@ -50,7 +48,7 @@ def add_table_gradient(
     into: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
     grad: Float[Tensor, "points out"],
-    layout: "HashGridLayout",
+    layout: HashGridLayout,
     used: Int[Tensor, "1"] | None = None,
 ) -> None:
     """Add the gradient with respect to the table to `into`; nothing flows back from point `used` on."""
@@ -74,7 +72,7 @@ def point_gradient(
     table: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
     grad: Float[Tensor, "points out"],
-    layout: "HashGridLayout",
+    layout: HashGridLayout,
 ) -> Float[Tensor, "points 3"]:
     """Return the gradient with respect to the points, by the reference: it is wanted seldom."""
     with torch.enable_grad():
@@ -86,8 +84,6 @@ def point_gradient(
 
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
-
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
     table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)
     used = torch.full((1,), 3, device=device)
@@ -100,7 +96,7 @@ def trial(device: str = "cuda") -> None:
 
 # Kept: made anew, these numbers would go from the host to the device in each call, and the host would wait for it.
 @functools.cache
-def _levels(layout: "HashGridLayout", device: torch.device) -> tuple[Tensor, Tensor, Tensor, int]:
+def _levels(layout: HashGridLayout, device: torch.device) -> tuple[Tensor, Tensor, Tensor, int]:
     hashed = [int(layout.is_hashed(level)) for level in range(len(layout.resolutions))]
     resolution, hashed_there = (
         torch.tensor(row, dtype=torch.int32, device=device) for row in (layout.resolutions, hashed)

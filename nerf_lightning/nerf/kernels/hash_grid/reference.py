@@ -1,20 +1,17 @@
 """The hash grid in plain torch: the reference, for any device and dtype."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 """Of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table's size (Eq. 4)."""
 
 
 def interpolate_torch(
-    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
+    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: HashGridLayout
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level."""
     number = torch.arange(8, device=points.device)
@@ -30,7 +27,7 @@ def interpolate_torch(
     return torch.cat(features, dim=-1)
 
 
-def _entries(vertex: Int[Tensor, "points 8 3"], level: int, layout: "HashGridLayout") -> Int[Tensor, "points 8"]:
+def _entries(vertex: Int[Tensor, "points 8 3"], level: int, layout: HashGridLayout) -> Int[Tensor, "points 8"]:
     x, y, z = vertex.unbind(-1)
     if layout.is_hashed(level):
         # Products of at most 2^32 and a few thousand stay below 2^63.

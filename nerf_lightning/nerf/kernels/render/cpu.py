@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW as LARGEST_RAW_DENSITY
 from nerf_lightning.nerf.kernels.hash_grid.cpu import FEATURES, encode, level_arrays
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, next_occupied
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.mlp.cpu import (

@@ -78,7 +78,7 @@ def density(
 
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout
+    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 
     one, along = torch.ones(2, device=device), torch.tensor([[0.0, 0.0, 1.0]] * 2, device=device)
     rays, layout = RayBundle(-2 * along, along, one, 3 * one, along), hash_grid_layout(2, 6, 2, 8)

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays, write_point_gradient
-from nerf_lightning.nerf.kernels.hash_grid.op import hash_grid_layout, table_gradient
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.op import table_gradient
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
     ROWS,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
-from nerf_lightning.nerf.kernels.hash_grid.op import HashGridLayout
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 from nerf_lightning.nerf.kernels.march.grid import GridMarch
 from nerf_lightning.nerf.kernels.ragged.op import Integrated
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision

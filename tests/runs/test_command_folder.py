@@ -8,14 +8,14 @@ from support.running import refused, start_code
 from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs import output_folder
-from nerf_lightning.runs.folder import log_file
-from nerf_lightning.runs.output_folder import filled_folder
+from nerf_lightning.runs import command_folder
+from nerf_lightning.runs.command_folder import filled_folder
+from nerf_lightning.runs.run_folder import log_file
 
 
 @pytest.fixture(autouse=True)
 def no_sweep(monkeypatch):
-    monkeypatch.setattr(output_folder, "job_folder", lambda: None)
+    monkeypatch.setattr(command_folder, "job_folder", lambda: None)
 
 
 def begun(wanted):
@@ -57,7 +57,7 @@ def test_every_start_adds_its_lines(tmp_path):
 
 FULL = """
 import logging, pathlib, resource, signal, sys
-from nerf_lightning.runs.folder import log_file
+from nerf_lightning.runs.run_folder import log_file
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (60, 60))
 with log_file(pathlib.Path(sys.argv[1])):

@@ -8,7 +8,7 @@ from pathlib import Path
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import make_folder, remove_empty, require_no_way_out
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.folder import job_folder
+from nerf_lightning.runs.run_folder import job_folder
 
 
 def beside_checkpoint(checkpoint: Path, name: str) -> Path:

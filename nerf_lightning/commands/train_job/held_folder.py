@@ -15,7 +15,7 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import require_run
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, log_file, open_run, write_config
+from nerf_lightning.runs.run_folder import ResumePoint, RunFolder, job_folder, log_file, open_run, write_config
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.callbacks.watcher import errors_told_once
 from nerf_lightning.training.launch.preemption import wants_restart
