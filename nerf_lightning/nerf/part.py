@@ -39,6 +39,9 @@ class Part(nn.Module):
     of one may be replayed for others. A part of your own is taken at its word where its own class says so; else it is
     recorded only where that is asked for. What such a step changes in buffers are `sample_counts` alone."""
 
+    couples_rays: bool = False
+    """Whether what it makes of a ray depends on the others of a step: no tile and no process may part them then."""
+
     step_variant: Hashable = None
     """What the host has decided for the next step, which changes what kernels it takes."""
 

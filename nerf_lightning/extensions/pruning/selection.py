@@ -110,7 +110,7 @@ def _uniform(key: int, count: int) -> Float[Tensor, "count"]:
 def neurons_of(state: Mapping[str, Tensor], layer: HiddenLayer) -> Neurons:
     """Return the weights of a hidden layer."""
     matrix = state[layer.rows[0]]
-    bias = [state[name][:, None] for name in layer.rows[1:] if state[name].ndim == 1]
+    bias = [state[name][:, None] for name in layer.rows[1:2] if state[name].ndim == 1]
     readers = [state[name][:, : matrix.shape[0]] for name in layer.columns]
     return Neurons(torch.cat([matrix, *bias], dim=1), torch.cat(readers))
 

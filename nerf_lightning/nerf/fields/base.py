@@ -18,7 +18,8 @@ class HiddenLayer:
     """Neurons that a field could do without, by the names that its state has for what makes and what reads them."""
 
     rows: tuple[str, ...]
-    """What has an entry for each neuron along its first axis; the matrix that makes them comes first."""
+    """What has an entry for each neuron along its first axis; the matrix that makes them comes first, and
+    then its bias, if it has one."""
     columns: tuple[str, ...]
     """Matrices whose first columns read them, one each; columns that read something else follow."""
 

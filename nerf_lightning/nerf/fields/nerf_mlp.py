@@ -9,6 +9,7 @@ from torch.nn import functional
 
 from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field, HiddenLayer
+from nerf_lightning.nerf.fields.batch_norm import BatchNorm
 from nerf_lightning.nerf.geometry.boxes import require_box
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.matmul_precision import Linear, linear
@@ -34,6 +35,8 @@ class NerfMLP(Field):
         density_bias: added to the raw density before its activation; negative values start from empty space.
         density_noise: standard deviation of the Gaussian noise added to the raw density in training.
         xavier: Glorot uniform weights and zero biases, as in Keras; False: PyTorch's own initialization.
+        batch_norm: normalize every hidden layer over all samples of a step (the article's `bn`). Training
+            then takes whole batches, whatever `trainer.tile_points`, in one process.
         contraction: contract all space around the scene's box into a ball of radius 2; None: as the scene's space.
             Otherwise positions enter unchanged, as in the paper.
     """
@@ -51,6 +54,7 @@ class NerfMLP(Field):
         density_bias: float = 0.0,
         density_noise: float = 0.0,
         xavier: bool = True,
+        batch_norm: bool = False,
         contraction: bool | None = None,
     ):
         super().__init__()
@@ -68,17 +72,17 @@ class NerfMLP(Field):
         self.density_activation = density_activation
         self.density_bias = density_bias
         self.density_noise = density_noise
-        self.xavier = xavier
+        self.xavier, self.batch_norm = xavier, batch_norm
         self.contracted = Contracted(contraction)
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         inputs = position_encoder.out_dim
         sizes = [inputs] + [width] * (depth - 1)
         if skip is not None:
             sizes[skip] += inputs
-        self.trunk = nn.ModuleList(_hidden(size, width) for size in sizes)
+        self.trunk = nn.ModuleList(_hidden(size, width, batch_norm) for size in sizes)
         self.density_head = nn.Linear(width, 1)
         self.feature = Linear(width, width)
-        self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2)
+        self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2, batch_norm)
         self.color_head = nn.Linear(width // 2, 3)
         self.reset_parameters()
 
@@ -149,9 +153,12 @@ class NerfMLP(Field):
                 if self.xavier:
                     nn.init.xavier_uniform_(module.weight)
                     nn.init.zeros_(module.bias)
+            elif isinstance(module, BatchNorm):
+                module.reset_parameters()
 
     def _rows(self, layer: str) -> tuple[str, ...]:
-        return f"{layer}.0.weight", f"{layer}.0.bias"
+        normalized = ("weight", "bias", "running_mean", "running_variance") if self.batch_norm else ()
+        return f"{layer}.0.weight", f"{layer}.0.bias", *(f"{layer}.1.{name}" for name in normalized)
 
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
@@ -178,5 +185,6 @@ def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
     return linear(features, head.weight, head.bias, "float32")
 
 
-def _hidden(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(Linear(inputs, outputs), nn.ReLU(inplace=True))
+def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:
+    normalized = [BatchNorm(outputs)] if batch_norm else []
+    return nn.Sequential(Linear(inputs, outputs), *normalized, nn.ReLU(inplace=True))

@@ -22,7 +22,7 @@ from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import in_parallel, threads_on, torch_on_one_thread
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, pixels_in_tile, tiles
 from nerf_lightning.nerf.objective import Objective, StepOutput
-from nerf_lightning.nerf.part import sample_counts
+from nerf_lightning.nerf.part import parts_of, sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.types.rays import Batch
 
@@ -62,14 +62,17 @@ class TileGradients:
 
     Args:
         objective: the loss.
-        points: most points that a tile may send through a field at once; None: the whole batch is a tile.
+        points: most points that a tile may send through a field at once; None: the whole batch is a tile, as it is
+            where a part looks at all rays of a step (`Part.couples_rays`).
         jitter: False: no random numbers.
     """
 
     guards = replays = False  # see `RecordedGradients`
 
     def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
-        self.objective, self.points, self.jitter = objective, points, jitter
+        self.objective, self.jitter = objective, jitter
+        self.takes_whole_batches = any(part.couples_rays for part in parts_of(objective))
+        self.points = points
 
     def __call__(
         self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
@@ -129,6 +132,15 @@ class TileGradients:
         return StepOutput.joined(seen)
 
     @property
+    def points(self) -> int | None:
+        """Most points that a tile may send through a field at once; None: the whole batch is a tile."""
+        return self._points
+
+    @points.setter
+    def points(self, points: int | None) -> None:
+        self._points = None if self.takes_whole_batches else points
+
+    @property
     def picture_points(self) -> int:
         """Most points that a tile of a picture, rendered beside the steps, may send through a field at once."""
         return self.points or WHOLE_BATCH_POINTS
@@ -144,9 +156,10 @@ class TileGradients:
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.points is None or self._pixels_in_tile(batch) <= self.objective.together:
+            tiles = "" if self.takes_whole_batches else ", or tiles (trainer.tile_points=auto)"
             raise InputError(
-                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
-                "or tiles (trainer.tile_points=auto)."
+                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), or a smaller "
+                f"model{tiles}."
             ) from error
         points = batch.num_rays * self.objective.model.points_per_ray(training=True)
         self.points = int(min(self.points, points)) // 2

@@ -48,8 +48,12 @@ def test_keeping_all_keeps_every_bit(by):
     assert all(torch.equal(state[name], tensor) for name, tensor in model.state_dict().items())
 
 
-def test_neurons_that_nothing_reads_go_and_nothing_changes():
-    field, thin = (tiny_field(depth=4, **width) for width in ({}, {"width": 8}))
+@pytest.mark.parametrize("batch_norm", [False, True])
+def test_neurons_that_nothing_reads_go_and_nothing_changes(batch_norm):
+    field, thin = (tiny_field(depth=4, batch_norm=batch_norm, **width) for width in ({}, {"width": 8}))
+    for name, buffer in field.named_buffers():
+        if "running" in name:
+            torch.nn.init.uniform_(buffer, 0.5, 1.5)
     wide = RadianceModel({"only": DenseLevel(StratifiedSampler(4), field)}).eval()
     narrow = RadianceModel({"only": DenseLevel(StratifiedSampler(4), thin)}).eval()
     state = field.state_dict()
