@@ -105,7 +105,7 @@ def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder(table, tmp_
     )
     _, rows = table()
     assert ours(rows)[0]["scene"] == "lego_200"
-    assert len(rows) == 6
+    assert len(rows) == 12
 
 
 @pytest.mark.parametrize("place", ["scene.root=data/room.{}", "scene.path='data/room.{}.npz'"])
