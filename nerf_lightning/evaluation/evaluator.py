@@ -117,6 +117,7 @@ class Scoring:
             worst = kept.finish(rows)
         lpips = None if self.lpips is None else self.lpips.net
         result = summary(rows) | {
+            "split_views": len(scene.splits[self.split]),
             "pictures": [scene.view_names[view] for view in shown_views],
             "worst_views": worst,
             "protocol": measured_how(scene, self.split, views, background, self.quantize, lpips, self.colors),

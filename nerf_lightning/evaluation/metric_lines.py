@@ -13,9 +13,10 @@ def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) 
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
     background = f", {protocol['background']} background" if has_transparency else ""
     fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
+    count, total = metrics["num_images"], metrics.get("split_views", metrics["num_images"])
+    views = f"{count} views" if count == total else f"{count} of {total} views"
     lines = [
-        f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
-        f"({metrics['num_images']} views{background})",
+        f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   ({views}{background})",
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]
@@ -31,7 +32,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) 
         angle = "" if normal is None else f"   normal error {normal:.1f} degrees"
         lines.append(f"depth error  {metrics['depth_error']:.4f} scene units{angle}")
     if metrics["lpips"] is not None:
-        lines.append(f"LPIPS        {metrics['lpips']:.4f}")
+        lines.append(f"LPIPS        {metrics['lpips']:.4f} ({protocol['lpips']})")
     lines.append(
         f"speed        {metrics['frames_per_second']:.3g} frames per second, "
         f"at most {metrics['peak_memory_gigabytes']:.2f} GB of memory"

@@ -147,11 +147,18 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_pa
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
 
 
-@pytest.mark.parametrize(("has_transparency", "said"), [(True, "2 views, white background)"), (False, "2 views)")])
-def test_a_background_is_named_only_where_one_can_be_seen_through_images(finished_run, has_transparency, said):
+@pytest.mark.parametrize(
+    ("has_transparency", "of", "said"),
+    [(True, 2, "(2 views, white background)"), (False, 2, "(2 views)"), (False, 5, "(2 of 5 views)")],
+)
+def test_views_are_counted_and_a_background_named_where_one_can_be_seen(finished_run, has_transparency, of, said):
     metrics = json.loads((finished_run / "metrics.json").read_text())
-    metrics["protocol"]["background"], metrics["num_images"] = "white", 2
-    assert said in metric_lines(metrics, finished_run, has_transparency)[0]
+    assert metrics["split_views"] == metrics["num_images"]
+    metrics |= {"num_images": 2, "split_views": of, "lpips": 0.125}
+    metrics["protocol"] |= {"background": "white", "lpips": "alex, version 0.1"}
+    lines = metric_lines(metrics, finished_run, has_transparency)
+    assert said in lines[0]
+    assert "LPIPS        0.1250 (alex, version 0.1)" in lines
 
 
 # Every experiment is composed and built elsewhere; these take the longest to end.
