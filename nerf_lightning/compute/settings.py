@@ -53,6 +53,10 @@ class ComputeSettings:
         if self.device_type == "xla":
             self.devices = xla_device.use_cores(self.devices)
 
+    def take_whole_batches(self) -> None:
+        """Leave tiles out, whatever was asked for: a part looks at all rays of a step."""
+        self.tile_points, self.measures_tile = None, False
+
     def keep_tile(self, measured: int | None) -> None:
         """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
         if self.measures_tile and measured is not None:

@@ -29,7 +29,7 @@ OWNED = {
     "precision": "trainer.precision",
     "reload_dataloaders_every_n_epochs": "data",
     "strategy": "trainer.devices",
-    "sync_batchnorm": "trainer.devices (no field normalizes over a batch)",
+    "sync_batchnorm": "trainer.devices=1 (field.batch_norm trains in one process)",
     "use_distributed_sampler": "trainer.devices",
     "val_check_interval": "trainer.val_every_steps",
 }

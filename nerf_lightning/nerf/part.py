@@ -40,7 +40,8 @@ class Part(nn.Module):
     recorded only where that is asked for. What such a step changes in buffers are `sample_counts` alone."""
 
     couples_rays: bool = False
-    """Whether what it makes of a ray depends on the others of a step: no tile and no process may part them then."""
+    """Whether a ray's result depends on the other rays of a step; tiles and processes must not split them. (Pixels that
+    a loss wants together are `Objective.together`.)"""
 
     step_variant: Hashable = None
     """What the host has decided for the next step, which changes what kernels it takes."""

@@ -1,6 +1,6 @@
 """Which run a command resumes, and whether it is a run with these settings.
 
-Which of its checkpoints, `checkpoints.reading.newest_checkpoint` says.
+`checkpoints.reading.newest_checkpoint` chooses among its checkpoints.
 """
 
 import logging

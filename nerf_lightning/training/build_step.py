@@ -5,6 +5,7 @@ from dataclasses import replace
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.compute import ranks
 from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import hold_to_budgets
@@ -21,7 +22,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.launch import xla
-from nerf_lightning.training.launch.fitting import require_deterministic
+from nerf_lightning.training.launch.fitting import require_deterministic, require_one_process
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
@@ -48,7 +49,7 @@ def build_step(
 
     Raises:
         InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
-            correction for one photograph.
+            correction for one photograph, several processes for a part that looks at all rays of a step.
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
@@ -93,5 +94,8 @@ def build_step(
         jitter=config.data.overfit_views is None,
         records=settings.records_there,
     )
+    require_one_process(train_step, ranks.world_size())
+    if train_step.tiles.takes_whole_batches:
+        settings.take_whole_batches()
     draw_weights(train_step)
     return train_step

@@ -49,9 +49,6 @@ class TrainStep:
         jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
             evaluation, so that steps differ in their pixels alone.
         records: tells whether to record steps where the weights are now, and to replay them; None: no.
-
-    Raises:
-        InputError: several processes share rays that a part wants to see together.
     """
 
     def __init__(
@@ -74,11 +71,6 @@ class TrainStep:
         self.clip_norm, self.sample_budget, self.start_weights = clip_norm, sample_budget, start_weights
         self.tiles, self.guard, self.records = TileGradients(objective, tile_points, jitter), StepGuard(), records
         self.gradients: TileGradients | RecordedGradients = self.tiles
-        if self.tiles.takes_whole_batches and ranks.world_size() > 1:
-            raise InputError(
-                f"The model's batch normalization needs all rays of a step, and {ranks.world_size()} processes share "
-                "them: train in one (trainer.devices=1), or leave field.batch_norm out."
-            )
         for part in objective.model.modules():
             if isinstance(part, Level):
                 part.returns_weights = objective.loss.needs_weights

@@ -95,9 +95,9 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         train_step.tiles.points = settings.tile_points
     settings.prepare(train_step.objective.model)
     job.system.record["precision"] = settings.precision
-    # A recording takes whole batches, too.
-    whole = train_step.tiles.takes_whole_batches or settings.records(train_step)
-    if former is None and settings.measures_tile and job.num_steps > SHORT_RUN and not whole:
+    # A recording takes whole batches.
+    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(train_step)
+    if former is None and measures_tile:
         tile, seconds = ranks.from_first(lambda: measured_tile(settings, train_step, job.data.batches))
         train_step.tiles.points = settings.tile_points = tile
         if seconds is not None:

@@ -86,7 +86,7 @@ class MemoryPlan:
 
 def memory_plan(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> MemoryPlan:
     """Plan by short trials: what a step and a picture hold is counted and scaled up."""
-    device, tile = settings.device, train_step.tiles.points
+    device, tile = settings.device, settings.tile_points
     free = free_memory(device)
     trial = try_out(settings, train_step, data.batches, tile)
     pixels = data.scene.pixels

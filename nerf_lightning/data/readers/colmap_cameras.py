@@ -18,7 +18,7 @@ class CameraModel:
     num_params: int
     lens: LensModel | None = None
     """None: none of ours."""
-    pinhole: tuple[int, int, int, int] = (-1, -1, -1, -1)
+    pinhole: tuple[int, ...] = ()
     """Places of fx, fy, cx, cy."""
     terms: tuple[int, int, int, int, int, int] = (-1, -1, -1, -1, -1, -1)
     """Places of k1, k2, k3, k4, p1, p2."""

@@ -15,12 +15,12 @@ EPSILON = 1e-3
 class BatchNorm(Part):
     """Normalize each neuron over all samples of a step: gamma (x - mean) / sqrt(variance + epsilon) + beta.
 
-    Outside of training, and wherever a step asks without gradients, mean and variance are running means over steps.
-    They follow the steps that are taken (`after_step`), not those that the guard leaves out.
+    Outside of training, mean and variance are running means over the steps that were taken. If a step asks several
+    times, they follow the last.
     """
 
     couples_rays = True
-    replays = False  # the running means change after a step, which a recording takes to be the same each time
+    replays = False  # a step writes `batch_mean` and `batch_variance`, which are no counts
 
     weight: Tensor
     bias: Tensor
@@ -39,7 +39,7 @@ class BatchNorm(Part):
 
     def forward(self, rows: Float[Tensor, "points width"]) -> Float[Tensor, "points width"]:
         """Return the normalized neurons of all points."""
-        if not (self.training and torch.is_grad_enabled()):
+        if not self.training:
             running = self.running_mean, self.running_variance
             return functional.batch_norm(rows, *running, self.weight, self.bias, eps=EPSILON)
         variance, mean = torch.var_mean(rows.detach().float(), dim=0, correction=0)
@@ -49,9 +49,10 @@ class BatchNorm(Part):
 
     def after_step(self, rgb: Tensor, target: Tensor, weight: Tensor) -> None:
         """Let the running means follow the step's."""
+        # On devices whose guard does not wait, a step that is not finite comes here, too.
+        finite = self.batch_mean.isfinite().all() & self.batch_variance.isfinite().all()
         for running, batch in ((self.running_mean, self.batch_mean), (self.running_variance, self.batch_variance)):
-            # On devices whose guard does not wait, a step that is not finite comes here, too.
-            running.lerp_(torch.where(batch.isfinite(), batch, running), 1.0 - MOMENTUM)
+            running.lerp_(torch.where(finite, batch, running), 1.0 - MOMENTUM)
 
     def validate_state(self) -> None:
         """Look at what was loaded.
@@ -60,7 +61,9 @@ class BatchNorm(Part):
             InputError: a negative variance.
         """
         if not bool((self.running_variance >= 0.0).all()):
-            raise InputError(f"The variances of batch normalization in the model's state are none. {ANOTHER}")
+            raise InputError(
+                f"The running variances of batch normalization in the model's state are negative. {ANOTHER}"
+            )
 
     def reset_parameters(self) -> None:
         """Forget what was learned."""

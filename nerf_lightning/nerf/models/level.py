@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.part import Part
+from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -38,6 +38,10 @@ class Level(Part):
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
 
+    takes_coupled_fields: bool = False
+    """Whether a step asks the field once, about all samples of its rays and nothing else, as batch normalization needs
+    it (`Part.couples_rays`)."""
+
     kernels: tuple[str, ...] = ()
     """Modules of `nerf.kernels` that it takes on a CPU, where kernels know its field."""
 
@@ -47,6 +51,13 @@ class Level(Part):
             raise ValueError(
                 f"{type(self).__name__} samples with {self.sampler_kind.__name__} or what follows it, and "
                 f"{type(sampler).__name__} does not: choose another sampler, or a model with another level"
+            )
+        coupled = [type(part).__name__ for part in parts_of(field) if part.couples_rays]
+        if coupled and not self.takes_coupled_fields:
+            raise ValueError(
+                f"{type(self).__name__} asks its field about samples that depend on what was asked before, and "
+                f"{coupled[0]} computes with the samples of a whole step: leave field.batch_norm out, or train a model "
+                "without an occupancy grid or a proposal (model=nerf)"
             )
         self.sampler = sampler
         self.field = field

@@ -34,6 +34,7 @@ class ProposalLevel(DenseLevel):
     """
 
     has_color = False
+    takes_coupled_fields = False  # it does not learn in every step
 
     def __init__(
         self,

@@ -72,7 +72,7 @@ class TileGradients:
     def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
         self.objective, self.jitter = objective, jitter
         self.takes_whole_batches = any(part.couples_rays for part in parts_of(objective))
-        self.points = points
+        self.points = None if self.takes_whole_batches else points
 
     def __call__(
         self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
@@ -132,15 +132,6 @@ class TileGradients:
         return StepOutput.joined(seen)
 
     @property
-    def points(self) -> int | None:
-        """Most points that a tile may send through a field at once; None: the whole batch is a tile."""
-        return self._points
-
-    @points.setter
-    def points(self, points: int | None) -> None:
-        self._points = None if self.takes_whole_batches else points
-
-    @property
     def picture_points(self) -> int:
         """Most points that a tile of a picture, rendered beside the steps, may send through a field at once."""
         return self.points or WHOLE_BATCH_POINTS
@@ -156,10 +147,10 @@ class TileGradients:
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.points is None or self._pixels_in_tile(batch) <= self.objective.together:
-            tiles = "" if self.takes_whole_batches else ", or tiles (trainer.tile_points=auto)"
+            cures = ["fewer rays (data.batch_rays)", "a smaller model", "tiles (trainer.tile_points=auto)"]
+            possible = cures[:2] if self.takes_whole_batches else cures
             raise InputError(
-                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), or a smaller "
-                f"model{tiles}."
+                f"There is no memory for a training step: {error}. Use {', '.join(possible[:-1])} or {possible[-1]}."
             ) from error
         points = batch.num_rays * self.objective.model.points_per_ray(training=True)
         self.points = int(min(self.points, points)) // 2

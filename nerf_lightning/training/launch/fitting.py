@@ -20,9 +20,11 @@ from nerf_lightning.checkpoints.format import PRECISIONS
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.part import parts_of
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.launch.strategy import OneSumPerStep
+from nerf_lightning.training.step import TrainStep
 
 log = logging.getLogger(__name__)
 
@@ -70,11 +72,26 @@ def require_fitting(trainer: Trainer) -> None:
     Raises:
         InputError: with what to set instead.
     """
+    require_one_process(trainer.lightning_module.train_step, trainer.world_size)  # type: ignore[arg-type]
     reasons = [*_of_settings(trainer), *_of_devices(trainer), *_of_callbacks(trainer)]
     if reasons:
         raise InputError(reasons[0])
     if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
         require_deterministic(trainer.lightning_module, trainer.strategy.root_device.type)
+
+
+def require_one_process(train_step: TrainStep, world_size: int) -> None:
+    """Refuse several processes where a part looks at all rays of a step.
+
+    Raises:
+        InputError: with its class.
+    """
+    coupled = [type(part).__name__ for part in parts_of(train_step.objective) if part.couples_rays]
+    if coupled and world_size > 1:
+        raise InputError(
+            f"{coupled[0]} looks at all rays of a step, and {world_size} processes share them: train in one "
+            "(trainer.devices=1)."
+        )
 
 
 def _of_settings(trainer: Trainer) -> Iterator[str]:

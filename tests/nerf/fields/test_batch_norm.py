@@ -4,15 +4,24 @@ import copy
 
 import pytest
 import torch
+from support.configs import composed
 from support.running import refused
 from support.scenes import ball_scene, tiny_field, tiny_model
 from support.steps import make_step
 
-from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.fields.batch_norm import EPSILON, BatchNorm
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
+from nerf_lightning.nerf.models.proposal_level import ProposalLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.part import parts_of
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.build_step import build_step
+from nerf_lightning.training.launch.fitting import require_one_process
+from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
 @pytest.fixture
@@ -32,18 +41,16 @@ def test_training_normalizes_by_the_rows_and_evaluation_by_running_means(layer):
     rows = 5.0 + 3.0 * torch.randn(40, 3)
     mean, variance = rows.mean(dim=0), rows.var(dim=0, correction=0)
     torch.testing.assert_close(layer(rows), normalized(rows, mean, variance, layer))
-    with torch.no_grad():
-        torch.testing.assert_close(layer(rows), normalized(rows, 0.0, torch.ones(3), layer))
     layer.after_step(rows, rows, rows)
     expected = normalized(rows, 0.01 * mean, 0.99 + 0.01 * variance, layer)
     torch.testing.assert_close(layer.eval()(rows), expected)
 
 
-def test_a_step_that_is_not_finite_leaves_the_running_means(layer):
-    layer(torch.tensor([[1.0, float("nan"), 2.0], [3.0, 4.0, float("inf")]]))
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_step_that_is_not_finite_leaves_the_running_means(layer, value):
+    layer(torch.tensor([[1.0, value, 2.0], [3.0, 4.0, 5.0]]))
     layer.after_step(*torch.zeros(3, 1))
-    assert layer.running_mean.tolist() == pytest.approx([0.02, 0.0, 0.0])
-    assert bool(layer.running_variance.isfinite().all())
+    assert (layer.running_mean.tolist(), layer.running_variance.tolist()) == ([0.0] * 3, [1.0] * 3)
 
 
 def test_every_hidden_layer_of_the_article_has_it_and_no_head():
@@ -75,9 +82,26 @@ def test_no_tile_parts_a_batch():
         assert torch.equal(whole, tiled)
 
 
-def test_several_processes_are_refused(monkeypatch):
-    monkeypatch.setattr(ranks, "world_size", lambda: 2)
-    refused(make_step, None, tiny_model(batch_norm=True), parts=("2 processes", "field.batch_norm"))
+def test_the_settings_of_a_run_follow():
+    settings = TrainerSettings(accelerator="cpu", tile_points=4096)
+    config = composed("train", "model=nerf_tiny", "field.batch_norm=true")
+    build_step(config, settings, ball_scene(), Progress(64))
+    assert (settings.tile_points, settings.measures_tile) == (None, False)
+
+
+def test_several_processes_are_refused():
+    step = make_step(None, tiny_model(batch_norm=True))
+    require_one_process(step, 1)
+    refused(require_one_process, step, 2, parts=("BatchNorm", "2 processes", "trainer.devices=1"))
+
+
+@pytest.mark.parametrize(
+    ("level", "sampler"),
+    [(RaggedLevel, OccupancySampler), (MaskedLevel, OccupancySampler), (ProposalLevel, StratifiedSampler)],
+)
+def test_levels_whose_samples_depend_on_the_field_refuse_it(level, sampler):
+    with pytest.raises(ValueError, match=r"BatchNorm.*leave field\.batch_norm out.*model=nerf"):
+        level(sampler(8), tiny_field(batch_norm=True))
 
 
 def test_a_new_attempt_forgets(layer):

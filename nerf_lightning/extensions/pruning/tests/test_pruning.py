@@ -18,7 +18,7 @@ from nerf_lightning.config.load_model import load_model
 from nerf_lightning.extensions.pruning.fine_tuning import fine_tuning
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights, reached_entries
-from nerf_lightning.extensions.pruning.selection import Neurons, choose, coreset, importance
+from nerf_lightning.extensions.pruning.selection import Neurons, choose, coreset, importance, neurons_of
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.part import fit_parts
@@ -54,6 +54,9 @@ def test_neurons_that_nothing_reads_go_and_nothing_changes(batch_norm):
     for name, buffer in field.named_buffers():
         if "running" in name:
             torch.nn.init.uniform_(buffer, 0.5, 1.5)
+    assert (
+        neurons_of(field.state_dict(), field.hidden_layers()[0]).incoming.shape[1] == field.trunk[0][0].in_features + 1
+    )
     wide = RadianceModel({"only": DenseLevel(StratifiedSampler(4), field)}).eval()
     narrow = RadianceModel({"only": DenseLevel(StratifiedSampler(4), thin)}).eval()
     state = field.state_dict()

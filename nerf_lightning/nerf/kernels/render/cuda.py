@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.mlp.op import mlp
 from nerf_lightning.nerf.kernels.ragged.op import Integrated, integrate, integrate_dense
@@ -78,8 +79,6 @@ def density(
 
 def trial(device: str = "cuda") -> None:
     """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
-    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
-
     one, along = torch.ones(2, device=device), torch.tensor([[0.0, 0.0, 1.0]] * 2, device=device)
     rays, layout = RayBundle(-2 * along, along, one, 3 * one, along), hash_grid_layout(2, 6, 2, 8)
     table = torch.ones(layout.offsets[-1], 2, device=device, requires_grad=True)
