@@ -6,7 +6,6 @@ is stored but how many rays have been seen, so a resumed run goes on exactly whe
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import ModuleType
 
 import torch
 from jaxtyping import Int
@@ -18,7 +17,7 @@ from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
-from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.pixels.op import Domain, Order, has_kernel, ordered_batch
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
@@ -186,24 +185,23 @@ class RayBatches:
     @torch_on_one_thread()
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
-        kernels = cuda_backend("pixels.cuda", self.whole.ends.device)
-        if kernels is not None and self.patch == 1 and self.views is None:
-            return self._in_one_kernel(kernels, attempt, rays_seen, batch_rays)
+        if self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device):
+            return self._in_one_kernel(attempt, rays_seen, batch_rays)
         pixels = self.pixels_at(attempt, rays_seen, batch_rays)
         batch = gather_batch(self.scene, pixels)
         if self.depths is None:
             return batch
         return self.depths.told(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
-    def _in_one_kernel(self, kernels: ModuleType, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
+    def _in_one_kernel(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
         domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
-        rays = kernels.Order(places, len(domain), fold(self.seed, attempt, purpose))
-        numbered = kernels.Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
+        rays = Order(places, len(domain), fold(self.seed, attempt, purpose))
+        numbered = Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
         if self.depths is None:
-            return kernels.batch(rays, numbered, self.scene.pixels)
+            return ordered_batch(rays, numbered, self.scene.pixels)
         among, key = self._depth_places_at(rays_seen, batch_rays), fold(self.seed, attempt, "depths")
-        of_known = kernels.Order(among, len(self.depths), key)
-        return kernels.batch(rays, numbered, self.scene.pixels, self.depths.depths, of_known)
+        of_known = Order(among, len(self.depths), key)
+        return ordered_batch(rays, numbered, self.scene.pixels, self.depths.depths, of_known)
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""

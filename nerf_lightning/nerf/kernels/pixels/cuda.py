@@ -3,14 +3,13 @@
 It is `RayBatches.at` for single pixels, bit for bit. `TRITON_INTERPRET=1` runs it without a GPU.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Int
-from torch import Tensor
 
+from nerf_lightning.nerf.kernels.pixels.op import NOWHERE, Domain, Order
 from nerf_lightning.nerf.kernels.random.cuda import mix
 from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
 from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
@@ -20,46 +19,10 @@ BLOCK = 64
 """Few, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
 
 
-class Order(NamedTuple):
-    """Places in a row of things that follow each other anew in each epoch."""
-
-    places: range
-    size: int
-    """Of an epoch, whose order is `randomness.permute` with the key `fold(*parts, epoch)`."""
-    key: int
-    """fold(*parts)."""
-
-
-class Domain(NamedTuple):
-    """The pixels that are numbered (`data.ray_batches.PixelDomain`)."""
-
-    ends: Int[Tensor, "views"]
-    """The number that follows each view's last pixel."""
-    columns: Int[Tensor, "views"]
-    """Pixels in a row of each view that are numbered."""
-    views: Int[Tensor, "views"]
-    """Which view each is."""
-    left: Int[Tensor, "views"]
-    """Column of its first numbered pixel."""
-    top: Int[Tensor, "views"]
-    """Row of it."""
-
-
-NOWHERE = Order(range(0), 1, 0)
-
-
 def batch(
     rays: Order, domain: Domain, store: PixelStore, known: KnownDepths | None = None, of_known: Order = NOWHERE
 ) -> Batch:
-    """Return the pixels at some places of the order of a domain, then those at some places of all of known distance.
-
-    Args:
-        rays: places in the domain.
-        domain: what is numbered.
-        store: all pixels.
-        known: those whose distance is known; None: no distances are asked for.
-        of_known: places among them.
-    """
+    """Return the batch (`op.ordered_batch`)."""
     device, several = store.rgba.device, len(rays.places)
     count = several + len(of_known.places)
     view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
