@@ -233,6 +233,13 @@ def test_files_and_pages_that_are_linked_are_there():
     assert not missing
 
 
+def test_files_of_the_table_of_tasks_are_there():
+    table = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## Where to begin")[2]
+    named = re.findall(r"`((?:\w+/)+(?:\w+\.py)?)`", table.partition("\n## ")[0])
+    assert len(named) > 30
+    assert [name for name in named if not (ROOT / "nerf_lightning" / name).exists()] == []
+
+
 @pytest.mark.minutes
 def test_the_site_is_built_without_a_warning(tmp_path):
     for needed in ("furo", "myst_nb", "sphinx_copybutton"):
