@@ -1,11 +1,13 @@
 """The triton kernels that make batches and rays against their references."""
 
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import torch
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.kernels.pixels import op
 from nerf_lightning.nerf.kernels.rays.cuda import LENSES
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
@@ -32,11 +34,13 @@ def check_pixels(kernels, device, generator, rays):
 
     for masked, every, attempt, seen in ((False, 0, 0, 0), (True, 8, 1, 33 * rays), (True, 3, 0, (1 << 33) + 5)):
         expected = batches("cpu", masked, every).at(attempt, seen)
-        found = batches(device, masked, every)._in_one_kernel(kernels, attempt, seen, None)
+        with patch.object(op, "cuda_backend", lambda *given: kernels):
+            found = batches(device, masked, every).at(attempt, seen)
         assert len(found.tensors()) == (7 if every else 5)
         for one, other in zip(found.tensors(), expected.tensors(), strict=True):
             assert torch.equal(one.cpu(), other)
-    assert batches(device, True, 0)._in_one_kernel(kernels, 0, 0, 0).num_rays == 0
+    with patch.object(op, "cuda_backend", lambda *given: kernels):
+        assert batches(device, True, 0).at(0, 0, 0).num_rays == 0
 
 
 def check_rays(kernels, device, generator, rays):
