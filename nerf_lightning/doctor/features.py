@@ -24,8 +24,9 @@ PLACES, SPACING = 4, 4.0
 # A match must be this much better than the second best (of distances; Lowe, "Distinctive image features", 2004).
 RATIO = 0.85
 THUMBNAIL = 24
-# Fine detail is looked for at no more pixels than this along the longer side; finer is noise on many cameras.
-SHARP_SIDE = 1600
+# Fine detail is looked for at no more pixels than this along the longer side, whatever the photographs were shrunk to;
+# finer is noise on many cameras.
+SHARP_SIDE = 480
 # Deviations (pixels) of what blurs the picture for fine and for coarse detail; pixels of the outline that are left out;
 # slope (per pixel, of 1) from which on there is texture, and pixels of it that tell something.
 FINE, COARSE, OUTLINE = 0.7, 2.0, 3
@@ -192,10 +193,15 @@ def fineness_of(pixels: PixelStore, view: int) -> Float[Tensor, "directions"]:
     rgba, kept = pixels.view(view), pixels.kept(view)
     solid = rgba[..., 3] > 252 if kept is None else (rgba[..., 3] > 252) & kept
     both = torch.stack([rgba[..., 1] / 255, solid.float()])
-    step = -(-max(rgba.shape[:2]) // SHARP_SIDE)
-    grey, whole = functional.avg_pool2d(both, step)[:, None] if step > 1 else both[:, None]
+    share = SHARP_SIDE / max(rgba.shape[:2])
+    if share < 1.0:
+        size = [max(1, round(share * side)) for side in rgba.shape[:2]]
+        both = functional.interpolate(both[None], size, mode="bilinear", antialias=True)[0]
+    grey, whole = both[:, None]
     # The outline against what is transparent is as sharp in a blurred photograph.
-    rim = functional.max_pool2d(functional.pad(1 - whole, (OUTLINE,) * 4, value=1.0), 2 * OUTLINE + 1, stride=1)
+    rim = functional.max_pool2d(
+        functional.pad((whole < 0.999).float(), (OUTLINE,) * 4, value=1.0), 2 * OUTLINE + 1, stride=1
+    )
     slopes = torch.cat(_gradient(_blurred(grey, COARSE)))
     power = slopes.square().sum(dim=0)
     inside = rim[0] == 0

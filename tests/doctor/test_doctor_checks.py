@@ -6,6 +6,7 @@ from support.brick_captures import of_views
 from support.captures import real_capture
 from support.doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
 from support.scenes import ball_scene
+from torch.nn.functional import avg_pool2d
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
@@ -17,6 +18,7 @@ from nerf_lightning.doctor.examine import advice, examine, gather_evidence
 from nerf_lightning.doctor.features import fineness_of
 from nerf_lightning.doctor.matches import nearest_views
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.types.scene import PixelStore
 
 TYPED = {"near": "8", "far": "12"}
 """What the protocol of a scene has where a person has said it."""
@@ -77,6 +79,22 @@ def test_a_photograph_whose_camera_moved_is_named_and_no_sharp_one(name):
         soft = replace(sharp, looks=replace(sharp.looks, fineness=fineness))
         check = judged(soft, "sharpness", "look", "1 of")
         assert check.message.split("blurred: ")[1].split(";")[0] == scene.view_names[view]
+
+
+@pytest.mark.parametrize("step", [2, 3])
+def test_sharpness_does_not_depend_on_how_far_photographs_are_shrunk(step):
+    torch.manual_seed(0)
+    picture = avg_pool2d(torch.rand(1, 3, 1448, 2168), 9, stride=1)
+    whole, shrunk = (fineness_of(store_of(255 * each), 0) for each in (picture, avg_pool2d(picture, step)))
+    torch.testing.assert_close(shrunk, whole, atol=0.1, rtol=0)
+
+
+def store_of(picture):
+    """A store of one opaque picture, its channels first."""
+    height, width = picture.shape[2:]
+    rgba = torch.cat([picture[0], torch.full((1, height, width), 255.0)]).permute(1, 2, 0).reshape(-1, 4)
+    sizes = (torch.tensor([each]) for each in (0, width, height))
+    return PixelStore(rgba.round().to(torch.uint8), *sizes, False, None)
 
 
 def test_without_texture_sharpness_is_not_judged():
