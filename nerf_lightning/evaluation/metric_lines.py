@@ -13,7 +13,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) 
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
     background = f", {protocol['background']} background" if has_transparency else ""
     fitted = "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB with fitted colors (cc_psnr)"
-    count, total = metrics["num_images"], metrics.get("split_views", metrics["num_images"])
+    count, total = metrics["num_images"], metrics["split_views"]
     views = f"{count} views" if count == total else f"{count} of {total} views"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   ({views}{background})",

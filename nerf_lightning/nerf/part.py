@@ -108,6 +108,11 @@ def parts_of(*modules: nn.Module) -> Iterator[Part]:
                 yield part
 
 
+def coupled_parts(module: nn.Module) -> list[str]:
+    """Return the classes of the parts within a module that look at all rays of a step (`Part.couples_rays`)."""
+    return [type(part).__name__ for part in parts_of(module) if part.couples_rays]
+
+
 def _nearest_parts(module: nn.Module) -> Iterator[Part]:
     """Return the parts within a module that lie in no other part within it."""
     for child in module.children():

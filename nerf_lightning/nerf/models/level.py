@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.part import Part, parts_of
+from nerf_lightning.nerf.part import Part, coupled_parts
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -52,12 +52,11 @@ class Level(Part):
                 f"{type(self).__name__} samples with {self.sampler_kind.__name__} or what follows it, and "
                 f"{type(sampler).__name__} does not: choose another sampler, or a model with another level"
             )
-        coupled = [type(part).__name__ for part in parts_of(field) if part.couples_rays]
+        coupled = coupled_parts(field)
         if coupled and not self.takes_coupled_fields:
             raise ValueError(
-                f"{type(self).__name__} asks its field about samples that depend on what was asked before, and "
-                f"{coupled[0]} computes with the samples of a whole step: leave field.batch_norm out, or train a model "
-                "without an occupancy grid or a proposal (model=nerf)"
+                f"{coupled[0]} needs all samples of a step in one call, and {type(self).__name__} makes none: leave "
+                "field.batch_norm out, or train a model without an occupancy grid or a proposal (model=nerf)"
             )
         self.sampler = sampler
         self.field = field

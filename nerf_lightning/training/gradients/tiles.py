@@ -22,7 +22,7 @@ from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
 from nerf_lightning.nerf.kernels.threads import in_parallel, threads_on, torch_on_one_thread
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, pixels_in_tile, tiles
 from nerf_lightning.nerf.objective import Objective, StepOutput
-from nerf_lightning.nerf.part import parts_of, sample_counts
+from nerf_lightning.nerf.part import coupled_parts, sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.types.rays import Batch
 
@@ -71,7 +71,7 @@ class TileGradients:
 
     def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
         self.objective, self.jitter = objective, jitter
-        self.takes_whole_batches = any(part.couples_rays for part in parts_of(objective))
+        self.takes_whole_batches = bool(coupled_parts(objective))
         self.points = None if self.takes_whole_batches else points
 
     def __call__(

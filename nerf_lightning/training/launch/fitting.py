@@ -20,7 +20,7 @@ from nerf_lightning.checkpoints.format import PRECISIONS
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.part import parts_of
+from nerf_lightning.nerf.part import coupled_parts
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.launch.strategy import OneSumPerStep
@@ -86,7 +86,7 @@ def require_one_process(train_step: TrainStep, world_size: int) -> None:
     Raises:
         InputError: with its class.
     """
-    coupled = [type(part).__name__ for part in parts_of(train_step.objective) if part.couples_rays]
+    coupled = coupled_parts(train_step.objective)
     if coupled and world_size > 1:
         raise InputError(
             f"{coupled[0]} looks at all rays of a step, and {world_size} processes share them: train in one "
