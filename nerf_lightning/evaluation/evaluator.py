@@ -14,7 +14,7 @@ from nerf_lightning.evaluation.camera_fit import fitted_camera
 from nerf_lightning.evaluation.color_fit import exposure_fitted
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
-from nerf_lightning.evaluation.lpips import load_lpips
+from nerf_lightning.evaluation.lpips import LPIPS, Net
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
@@ -43,8 +43,7 @@ class Scoring:
         quantize: round renders to 8 bits first, as in a saved image.
         num_pictures: number of views whose images are kept, evenly spread.
         num_worst: number of further views with the lowest PSNR.
-        lpips_weights: a file with the backbone's weights; None: LPIPS is not computed.
-        lpips_net: the backbone, alex or vgg.
+        lpips: compute LPIPS on this network, alex or vgg, whose weights torchvision downloads once; None: do not.
         colors: raw compares renders unchanged; half_fit fits exposure and white balance to the left half of each
             photograph and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
         nearest_views: for models that render from photographs: also evaluate baselines without a model from this number
@@ -56,8 +55,7 @@ class Scoring:
     quantize: bool = False
     num_pictures: int = 5
     num_worst: int = 3
-    lpips_weights: str | None = None
-    lpips_net: Literal["alex", "vgg"] = "alex"
+    lpips: Net | None = None
     colors: Colors = "raw"
     nearest_views: int | None = None
 
@@ -71,7 +69,7 @@ class Scoring:
         for name, count in (("num_pictures", self.num_pictures), ("num_worst", self.num_worst)):
             if count < 0:
                 raise InputError(f"evaluation.{name}={count}: give 0 or more.")
-        self.lpips = load_lpips(self.lpips_weights, self.lpips_net)
+        self._lpips = None if self.lpips is None else LPIPS(self.lpips)
 
     def score(
         self,
@@ -115,12 +113,11 @@ class Scoring:
                     kept.save(row["name"], shown)
             rows = ranks.in_turn(rows)
             worst = kept.finish(rows)
-        lpips = None if self.lpips is None else self.lpips.net
         result = summary(rows) | {
             "split_views": len(scene.splits[self.split]),
             "pictures": [scene.view_names[view] for view in shown_views],
             "worst_views": worst,
-            "protocol": measured_how(scene, self.split, views, background, self.quantize, lpips, self.colors),
+            "protocol": measured_how(scene, self.split, views, background, self.quantize, self.lpips, self.colors),
             "origin": origin or {},
             "environment": environment(),
         }
@@ -157,7 +154,7 @@ class Scoring:
             picture = replace(picture, rgb=(picture.rgb.clamp(0, 1) * 255).round() / 255)
         render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
         row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(render, true, counts)}
-        row["lpips"] = None if self.lpips is None else self.lpips.score(masked_out(render, true, counts), true)
+        row["lpips"] = None if self._lpips is None else self._lpips.score(masked_out(render, true, counts), true)
         depth = told_length(scene)[0] * picture.depth
         return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
 

@@ -28,7 +28,7 @@ LABELS = {
     "depth_error": "depth error, scene units",
     "normal_error": "normal error",
 }
-WITHOUT_LPIPS = "not computed: it needs weights (evaluation.lpips_weights); metrics.json says where they come from"
+WITHOUT_LPIPS = "not computed (evaluation.lpips=alex)"
 MOST_VIEWS = 12
 MOST_ROWS = 5000
 MOST_PAIRS = 60

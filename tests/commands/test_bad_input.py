@@ -4,6 +4,7 @@ import re
 import signal
 import sys
 import time
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -120,8 +121,9 @@ def test_no_ffmpeg_or_no_such_background_for_a_render(nerf, last, tmp_path, monk
     assert not list(tmp_path.glob("*.mp4"))
 
 
-def test_lpips_without_its_weights(nerf, last, tmp_path):
-    said(nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "does not exist", "alexnet")
+@pytest.mark.skipif(find_spec("torchvision") is not None, reason="torchvision is installed (the extra lpips)")
+def test_lpips_without_torchvision(nerf, last):
+    said(nerf("eval", f"ckpt={last}", "evaluation.lpips=alex"), "needs torchvision", "pip install '.[lpips]'")
 
 
 @pytest.mark.slow

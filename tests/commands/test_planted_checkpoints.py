@@ -15,7 +15,6 @@ from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
-from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.messages.errors import InputError
 
 MEGABYTE = 2**20
@@ -53,20 +52,6 @@ def test_pickled_calls_do_not_run(nerf, capture, tmp_path):
         said(nerf(*command), "a.ckpt", "nothing from a file is executed")
     assert not mark.exists()
     assert not (tmp_path / "out").exists()
-
-
-def test_a_file_of_lpips_weights_does_not_run(tmp_path):
-    mark, weights = tmp_path / "ran", tmp_path / "weights.pth"
-    for legacy in (False, True):
-        torch.save(
-            {"features.0.weight": Payload(os.system, f"touch {mark}")},
-            weights,
-            _use_new_zipfile_serialization=not legacy,
-        )
-        refused(
-            load_lpips, str(weights), parts=("before version 1.6" if legacy else "nothing from a file is executed",)
-        )
-    assert not mark.exists()
 
 
 TARGETS = [

@@ -71,7 +71,7 @@ HARMLESS = [
     "~callbacks.monitor",
     "+optimizer.amsgrad=true",
     "path.views=[train/r_1.png,3]",
-    "evaluation.lpips_weights='my weights/alex.pt'",
+    "evaluation.lpips=alex",
     "model.levels.fine.field.skip=null",
 ]
 # Of the README, of train --help, and their kin; in parts that may be given together.
@@ -138,7 +138,6 @@ PLANTED = [
     "scene.masks=../../etc",
     "scene.masks=masks/../../etc",
     "scene.masks={a:['~/secret']}",
-    "evaluation.lpips_weights='C:\\weights.pth'",
     # Numbers that are none.
     "optimizer.lr=nan",
     "optimizer.betas=[0.9,-inf]",

@@ -45,7 +45,7 @@ def test_metrics_carry_their_protocol(finished_run):
     metrics = json.loads((finished_run / "metrics.json").read_text())
     assert metrics["num_images"] == 2
     assert metrics["lpips"] is None
-    assert "lpips_weights" in metrics["lpips_hint"]
+    assert "evaluation.lpips=alex" in metrics["lpips_hint"]
     assert metrics["psnr"] == pytest.approx(sum(row["psnr"] for row in metrics["per_image"]) / 2)
     protocol = metrics["protocol"]
     assert protocol["background"] == "black"

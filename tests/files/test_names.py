@@ -36,10 +36,7 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
             "picture.with_name(f'dynamic_mask_{picture.name}')",
         ),
     },
-    "evaluation": {
-        "folder / f'{part}.png'",
-        "files('torchmetrics') / 'functional' / 'image' / 'lpips_models' / f'{net}.pth'",
-    },
+    "evaluation": {"folder / f'{part}.png'"},
     "extensions": {
         *("keyframes / 'depth' / f'{path.stem}.png'", "folder / 'pose' / f'{stem}.txt'"),
         *("folder / 'intrinsics' / f'{stem}.txt'", "picture.with_name(picture.name.replace('frame', 'depth'))"),

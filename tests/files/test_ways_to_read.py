@@ -60,7 +60,6 @@ OTHERWISE = {
     "data/sfm/video_frames.py": ["imiter"],
     "files/atomic.py": ["open", "open"],
     "extensions/geometry_exports/points.py": ["open"],
-    "evaluation/lpips.py": ["load"],  # torchmetrics' own file
     "files/regular.py": ["open"],
 }
 

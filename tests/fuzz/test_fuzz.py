@@ -30,7 +30,6 @@ from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.pixels.picture_files import image_size, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.evaluation.lpips import LPIPS, load_lpips
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep
@@ -101,11 +100,6 @@ def filmed(folder):
     assert bool(torch.isfinite(cameras.c2w).all() and (cameras.focal > 0).all())
 
 
-def scored(folder):
-    picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
-    assert 0 <= load_lpips(str(folder / "alexnet.pth"), "alex").score(picture, 1 - picture) < float("inf")
-
-
 def decoded(name):
     def decode(folder):
         size, rgba = image_size(folder / name), read_rgba(folder / name)
@@ -165,9 +159,6 @@ KINDS = {
         (sweep_record(Path()).as_posix(),),
     ),
     "events": Kind(write_events, lambda f: curve_drawings(read_curves(f)), ("events.out.tfevents.1",), 15),
-    "weights of lpips": Kind(
-        lambda f: torch.save(LPIPS("alex").state_dict(), f / "alexnet.pth"), scored, ("alexnet.pth",), 10
-    ),
 }
 
 
