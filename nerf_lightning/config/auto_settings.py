@@ -47,11 +47,11 @@ SETTLED = (
 """What model=auto may set beside the model and the loss."""
 LARGE, LARGE_CELLS = "fast_large", 1024
 """The model of a scene in a box on a GPU, whose pixels are as small as the cells of so fine a grid, or smaller."""
-LARGE_STEPS, LARGE_TABLE = 576, 19
+SHORT_STEPS, LARGE_STEPS, LARGE_TABLE = 576, 1024, 20
 """For large pictures of a scene in a box: steps across it, and log2 of a hash table's entries.
 
-After 100 s, Lego (800 x 800) has 31.83 dB with 576 steps, and 31.19 dB with 384; after 300 s 33.51 dB with field=ngp,
-and 33.31 dB with ngp_fast.
+After 300 s, Lego (800 x 800) has 33.82 dB with 1024 steps, and 33.53 dB with 576 (docs/defaults.md); after 100 s 31.83
+dB with 576, and 31.19 dB with 384.
 """
 GPU_BATCHES = {
     "fast": {"data.batch_rays": 65_536, "data.sample_budget": 1 << 18},
@@ -219,8 +219,9 @@ def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
     """Return the steps, grid and layers that suit large pictures of a scene in a box; what a person has typed stays."""
     typed, suited = set(map(key_of, overrides)), []
     if STEPS_SETTING not in typed:
-        log.info("steps: %d across the box, because the pictures are large (%s=N)", LARGE_STEPS, STEPS_SETTING)
-        suited.append(f"{STEPS_SETTING}={LARGE_STEPS}")
+        steps = SHORT_STEPS if short else LARGE_STEPS
+        log.info("steps: %d across the box, because the pictures are large (%s=N)", steps, STEPS_SETTING)
+        suited.append(f"{STEPS_SETTING}={steps}")
     if not short and not typed & GRID_SETTINGS:
         suited += _grid(LARGE_CELLS, LARGE_TABLE, "because the pictures are large")
     if not short and not typed & {"field", "field.color_layers"}:

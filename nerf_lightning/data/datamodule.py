@@ -13,7 +13,7 @@ from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_dev
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches, WholeViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.types.progress import BATCH_SIZES, Progress
+from nerf_lightning.nerf.types.progress import Progress, batch_sizes
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
@@ -73,7 +73,7 @@ class RayDataModule(LightningDataModule):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
             require_memory(f"data.{name}={value}", value, lambda n: RAY_BYTES * n, f"data.{name}={{}}".format)
-        least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
+        least = batch_rays if sample_budget is None else batch_sizes(batch_rays)[-1]
         least = max(1, least // patch**2)
         if min(least, val_rays) < ranks.world_size():
             raise InputError(

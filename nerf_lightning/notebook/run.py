@@ -148,6 +148,7 @@ class StepwiseRun(Run):
             callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without
             loops=loops_after(0),
             progress=train_step.progress,
+            together=train_step.objective.together,
         )
         restore_run(state, train_step, train_step.device)
         self.system.load_state_dict(content["state_dict"])

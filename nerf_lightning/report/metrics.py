@@ -43,6 +43,9 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
         ("PSNR, worst", _shown("psnr", worst.get("value"))),
         *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
     ]
+    count, of = number(metrics.get("num_images")), number(metrics.get("split_views"))
+    if count is not None and of is not None:
+        shown.append(("views measured", f"{count:,.0f}" if count == of else f"{count:,.0f} of {of:,.0f}"))
     origin = mapping(metrics.get("origin"))
     trained = number(note.get("training_seconds"))
     shown.append(("training", "" if trained is None else spoken(trained)))

@@ -79,6 +79,7 @@ def require_resumable(
     callbacks: Iterable[Any],
     loops: Mapping[str, Any],
     progress: Progress,
+    together: int,
 ) -> None:
     """Refuse a checkpoint that is sound in itself, and not of this run.
 
@@ -92,6 +93,7 @@ def require_resumable(
             computation (`needs_state`) has to be there.
         loops: what the trainer's loops keep.
         progress: the run's, as the loader has set it up.
+        together: pixels in a row of a batch that are not parted.
 
     Raises:
         InputError: with the place in the checkpoint.
@@ -116,7 +118,7 @@ def require_resumable(
             raise Mismatch("loops.fit_loop", f"has not taken the {content['global_step']} steps of the checkpoint")
         # Batches are allocated by these two.
         found, largest = Progress(**content[KEY]["progress"]), progress.largest_batch
-        if found.largest_batch != largest or found.batch_rays not in batch_sizes(largest):
+        if found.largest_batch != largest or found.batch_rays not in batch_sizes(largest, together):
             raise Mismatch("progress", f"has {found.batch_rays} rays of {found.largest_batch}, not those of the run")
 
 

@@ -31,7 +31,7 @@ def test_an_explanation_imports_nothing_heavy(words):
 def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_take(nerf):
     result = nerf("help", "data.sample_budget")
     assert result.code == 0
-    assert result.out.startswith("data.sample_budget=131072\n")
+    assert result.out.startswith("data.sample_budget=65536\n")
     assert "The target number of visible samples per step" in " ".join(result.out.split())
     assert "Takes int | null." in result.out
     assert "model=fast_large 262144" in " ".join(result.out.split())

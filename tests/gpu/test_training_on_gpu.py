@@ -10,7 +10,7 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out, gradient_bound
 from nerf_lightning.selftest.training import METHODS
-from nerf_lightning.training.gradients.recorded import cuda_graph
+from nerf_lightning.training.gradients.recorded import CudaGraphs
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 STEPS, TILE_POINTS = 50, 8192
@@ -65,7 +65,7 @@ def test_compiled_fields_compute_the_same(cuda):
 def test_replayed_steps_learn_what_steps_learn(model, cuda):
     """But for the order of sums, which a GPU leaves to chance."""
     runs = [step_by_step(model, cuda) for _ in range(2)]
-    replay_steps(runs[1].training, cuda_graph)
+    replay_steps(runs[1].training, CudaGraphs())
     for run in runs:
         for _ in range(STEPS):
             run.step()

@@ -9,7 +9,7 @@ from PIL import Image
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings
 from nerf_lightning.report.embedding import LONGEST_SIDE, embedded, embedded_file, embedded_video
-from nerf_lightning.report.metrics import WITHOUT_LPIPS, tables, views_on_page
+from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
 from nerf_lightning.report.page import Report, write_report
 
 
@@ -91,3 +91,10 @@ def test_the_page_says_what_lpips_needs_where_it_was_not_computed():
     assert ("LPIPS", WITHOUT_LPIPS) in dict(tables(protocol | {"lpips": None}))["Protocol"]
     assert ("LPIPS", WITHOUT_LPIPS) not in dict(tables(protocol | {"lpips": 0.1}))["Protocol"]
     assert dict(tables({}))["Protocol"] == []
+
+
+def test_the_page_says_how_many_of_a_splits_views_were_measured():
+    counts = {"num_images": 10, "split_views": 25}
+    assert ("views measured", "10 of 25") in facts(counts, {})
+    assert ("views measured", "25") in facts(counts | {"num_images": 25}, {})
+    assert "views measured" not in dict(facts({}, {}))

@@ -49,7 +49,7 @@ class Tape(TorchDispatchMode):
 
 
 def tape(work):
-    """Record work as `cuda_graph` does: after a round that allocates what stays."""
+    """Record work as `CudaGraphs` does: after a round that allocates what stays."""
     work()
     with Tape() as recorded:
         seen = work()

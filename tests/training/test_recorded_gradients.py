@@ -22,7 +22,7 @@ from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.training.attempts import restart
-from nerf_lightning.training.gradients.recorded import cuda_graph
+from nerf_lightning.training.gradients.recorded import CudaGraphs
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 CPU = torch.device("cpu")
@@ -150,7 +150,7 @@ def test_models_that_read_on_the_host_and_other_devices_are_refused(monkeypatch)
         TrainerSettings(accelerator="cpu", cuda_graph=True)
 
 
-def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
+def test_other_threads_may_pin_memory_while_a_graph_is_captured_and_graphs_share_memory(monkeypatch):
     asked = {}
 
     @contextmanager
@@ -161,8 +161,11 @@ def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
     for name, stand_in in {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock}.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(torch.cuda, "current_stream", Mock())
-    cuda_graph(lambda: Mock(spec=StepOutput))
-    assert asked == {"capture_error_mode": "thread_local"}
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", Mock(side_effect=[(0, 1), (0, 2)]))
+    record = CudaGraphs()
+    for _ in range(2):  # batches of two sizes
+        record(lambda: Mock(spec=StepOutput))
+        assert asked == {"pool": (0, 1), "capture_error_mode": "thread_local"}
 
 
 @pytest.mark.parametrize(

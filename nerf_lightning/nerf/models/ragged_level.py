@@ -134,11 +134,13 @@ class RaggedLevel(Level):
         return Rendering.from_light(rays, background, found.rgb, 1.0 - found.opacity, found.depth)
 
     def points_per_ray(self, before: float, training: bool) -> float:
-        """In training, as lately counted; in rendering 1, since few rays have more than a handful at a time."""
-        if not training:
-            return 1.0
+        """In training, as lately counted; in rendering all that are found at once on a GPU, and few (1) elsewhere."""
         counted = self.counter.per_ray
-        return max(1.0, float(self.sampler.samples_at_first) if counted is None else counted)
+        if training:
+            return max(1.0, float(self.sampler.samples_at_first) if counted is None else counted)
+        if counted is None or self.counter.mean.device.type != "cuda":
+            return 1.0
+        return max(1.0, self.sampler.found_per_visible * counted)
 
     def on_step(self, context: StepContext) -> None:
         """Let the sampler learn, where it is time, and average the samples per ray of the steps since."""

@@ -63,6 +63,8 @@ class RaggedSampler(Sampler, ABC):
 
     opaque_below: float = 1e-3
     """A ray's samples end where less light than this is left; 0 keeps them all."""
+    found_per_visible: int = 4
+    """So many samples are found for each visible one, about: after a minute of training (instant-ngp expects 16)."""
     update_every: int = 16
     """Training steps between two updates; meanwhile a level counts how many samples rays have."""
     sample_budget: int | None = None

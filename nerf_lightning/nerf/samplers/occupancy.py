@@ -24,9 +24,6 @@ from nerf_lightning.nerf.types.scene import Scene
 log = logging.getLogger(__name__)
 
 CAPACITY = 1 << 20
-CANDIDATES = 4
-"""Arrays of intervals in occupied cells are so many times larger than those of the visible ones. After a minute of
-training there are four times as many, and arrays hold twice what is expected; in instant-ngp it is 16 over 1."""
 # Devices on which a number may be read on the host between two kernels while rendering.
 HOSTS = ("cpu", "cuda")
 RANGES = {
@@ -143,7 +140,7 @@ class OccupancySampler(RaggedSampler):
         rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
         capacity = self.capacity_for(rays)
         if capacity is not None and self.opaque_below > 0:
-            capacity = min(CANDIDATES * capacity, self._most_intervals(rays))
+            capacity = min(self.found_per_visible * capacity, self._most_intervals(rays))
         return march(rays, *self.grid_march(rays, random), capacity=capacity)[0]
 
     def grid_march(self, rays: RayBundle, random: RayRandom | None) -> GridMarch:

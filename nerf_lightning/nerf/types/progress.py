@@ -2,25 +2,37 @@
 
 from dataclasses import dataclass, fields
 
-BATCH_SIZES = 8
+SIZES_PER_HALVING, HALVINGS = 4, 7
+"""Of batches. Each size has a CUDA graph of its own, and what is wanted is rounded down by 8 % on average."""
+WHOLE_BLOCKS = 256
+"""Larger batches are multiples of this: kernels are compiled for rows that fill their blocks."""
 
 
-def batch_sizes(largest: int) -> list[int]:
-    """Return the sizes that batches may have, the largest first: it, its half, its quarter, ...
+def batch_sizes(largest: int, together: int = 1) -> list[int]:
+    """Return the sizes that batches may have, the largest first: about 0.84 times the one before each.
 
-    >>> batch_sizes(4096)
-    [4096, 2048, 1024, 512, 256, 128, 64, 32]
+    Args:
+        largest: the largest, a multiple of `together`.
+        together: all are multiples of it.
+
+    >>> batch_sizes(4096)[:9], batch_sizes(4096)[-1]
+    ([4096, 3328, 2816, 2304, 2048, 1536, 1280, 1024, 768], 32)
     """
-    return [max(1, largest >> number) for number in range(BATCH_SIZES)]
+    sizes = {largest}
+    for number in range(1, SIZES_PER_HALVING * HALVINGS + 1):
+        size = int(largest * 2.0 ** (-number / SIZES_PER_HALVING))
+        size -= size % WHOLE_BLOCKS if size > WHOLE_BLOCKS else 0
+        sizes.add(max(size - size % together, together))
+    return sorted(sizes, reverse=True)
 
 
 def batch_size(largest: int, wanted: float, together: int = 1) -> int:
-    """Return the largest of `batch_sizes` that is at most `wanted`, and a multiple of `together`, as `largest` is.
+    """Return the largest of `batch_sizes` that is at most `wanted`; the smallest where all are larger.
 
     >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, together=256)
-    (1024, 4096, 32, 256)
+    (1280, 4096, 32, 256)
     """
-    sizes = [size for size in batch_sizes(largest) if size % together == 0]
+    sizes = batch_sizes(largest, together)
     return next((size for size in sizes if size <= wanted), sizes[-1])
 
 

@@ -11,6 +11,7 @@ a model decides on the host between two steps has recordings of its own (`Part.s
 import logging
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,18 +36,30 @@ Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOu
 """Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
 
 
-def cuda_graph(work: Callable[[], StepOutput]) -> tuple[Callable[[], None], StepOutput]:
-    """Record work as a CUDA graph, after a few rounds of it on a stream of their own."""
-    graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(WARM_UPS):
-            work()
-    torch.cuda.current_stream().wait_stream(side)
-    # The thread that makes batches pins memory, which a capture would otherwise forbid in every thread.
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        seen = work()
-    return graph.replay, seen
+class CudaGraphs:
+    """Record work as CUDA graphs, each after a few rounds on a stream of their own.
+
+    All share the memory of what is under way, as no two run at a time and none reads what another has left: many sizes
+    of batches take as much memory as the largest.
+    """
+
+    def __init__(self) -> None:
+        self.pool: Any = None
+
+    def __call__(self, work: Callable[[], StepOutput]) -> tuple[Callable[[], None], StepOutput]:
+        """Return what does the work again, and what the work returned."""
+        if self.pool is None:
+            self.pool = torch.cuda.graph_pool_handle()
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(WARM_UPS):
+                work()
+        torch.cuda.current_stream().wait_stream(side)
+        # The thread that makes batches pins memory, which a capture would otherwise forbid in every thread.
+        with torch.cuda.graph(graph, pool=self.pool, capture_error_mode="thread_local"):
+            seen = work()
+        return graph.replay, seen
 
 
 @dataclass(frozen=True)
@@ -67,7 +80,7 @@ class RecordedGradients:
     Args:
         tiles: computes them.
         guard: sets those of a step to zero that are not finite, where one process has all of them.
-        record: makes a recording.
+        record: makes a recording; None: CUDA graphs.
 
     Raises:
         InputError: something here decides on the host what a step computes.
@@ -78,13 +91,13 @@ class RecordedGradients:
     replays = True
     """Whether batches are replayed: until a recording is refused."""
 
-    def __init__(self, tiles: TileGradients, guard: StepGuard, record: Recorder = cuda_graph):
+    def __init__(self, tiles: TileGradients, guard: StepGuard, record: Recorder | None = None):
         if kinds := not_replayed(tiles.objective):
             raise InputError(
                 "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
                 f"step: {', '.join(kinds)}. Leave it out."
             )
-        self.tiles, self.guard, self.record = tiles, guard, record
+        self.tiles, self.guard, self.record = tiles, guard, CudaGraphs() if record is None else record
         self.parts, self.parameters = list(parts_of(tiles.objective)), list(tiles.objective.parameters())
         self.guards = ranks.world_size() == 1  # else the gradients of all are added up first
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}

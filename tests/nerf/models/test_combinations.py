@@ -29,7 +29,7 @@ from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
-from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.progress import Progress, batch_sizes
 from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
@@ -125,7 +125,7 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     for _ in range(40):
         sizes.append(progress.batch_rays)
         train_step(loader.at(0, progress.rays_seen), optimizer)
-    assert set(sizes) <= {512 >> number for number in range(8)}
+    assert set(sizes) <= set(batch_sizes(512))
     changes = [place for place in range(1, 40) if sizes[place] != sizes[place - 1]]
     assert changes
     assert set(changes) <= {1, 16, 32}

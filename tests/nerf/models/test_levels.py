@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel, SampleCounter
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.part import StepContext, begin_step, fit_parts, statistics
 from nerf_lightning.nerf.randomness import batch_random
@@ -231,5 +232,14 @@ def test_samples_per_ray_are_measured_kept_and_loaded():
     other.load_state_dict(model.state_dict())
     assert other.points_per_ray(training=True) == counted
     assert statistics(model)["speed/samples_per_ray"] == pytest.approx(counted)
+    assert model.points_per_ray(training=False) == 1
     model.last.counter.reset_statistics()
     assert model.points_per_ray(training=True) == 200
+
+
+def test_tiles_of_pictures_on_a_gpu_are_cut_by_the_samples_that_their_rays_will_find():
+    level = a_level()
+    model, level.counter = RadianceModel({"fine": level}), SampleCounter()
+    del level.counter.mean
+    level.counter.mean, level.counter._per_ray = Mock(device=torch.device("cuda")), 3.0
+    assert tile_rays_for(model, 1200) == 1200 / 3 / 4

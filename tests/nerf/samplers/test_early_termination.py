@@ -11,9 +11,8 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.samplers import occupancy
 from nerf_lightning.nerf.samplers.early_termination import visible_samples
-from nerf_lightning.nerf.samplers.occupancy import CANDIDATES, OccupancySampler
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 RAYS = 40
 
@@ -58,7 +57,7 @@ def found_by(level, capacity, rays, random, monkeypatch):
 @pytest.mark.parametrize("scale", [0.0, 10.0, 300.0])
 @pytest.mark.parametrize("share", [0.0, 0.5])  # of cells; 0: all rays miss
 def test_a_capacity_keeps_the_same_samples(kernels, num_rays, scale, share, monkeypatch):
-    monkeypatch.setattr(occupancy, "CANDIDATES", 100)  # there is room for all intervals that may be visible
+    monkeypatch.setattr(OccupancySampler, "found_per_visible", 100)  # there is room for all intervals
     level, rays, random = a_level(RandomDensity(scale), share), some_rays(num_rays), batch_random(5, num_rays)
     with without("march.cpu", *(() if kernels else CPU_BACKENDS)):
         expected, features = found_by(level, None, rays, random, monkeypatch)
@@ -95,12 +94,12 @@ def test_intervals_that_nobody_looked_at_count_as_if_they_were_visible(monkeypat
     """Otherwise fewer samples were counted a ray, steps had more rays, and even more were dropped."""
     level, rays, random = a_level(RandomDensity(300.0), share=1.0), some_rays(RAYS), batch_random(5, RAYS)
     candidates = int(level.sampler(rays, random).found)
-    capacity = candidates // CANDIDATES - 20
+    capacity = candidates // OccupancySampler.found_per_visible - 20
     found, _ = found_by(level, capacity, rays, random, monkeypatch)
-    kept, dropped = int(found.bounds[-1]), candidates - CANDIDATES * capacity
+    kept, dropped = int(found.bounds[-1]), candidates - OccupancySampler.found_per_visible * capacity
     assert 0 < kept < capacity
     assert int(found.found) == kept + dropped
-    assert dropped >= 20 * CANDIDATES
+    assert dropped >= 20 * OccupancySampler.found_per_visible
 
 
 @pytest.mark.parametrize("capacity", [None, 8000])
