@@ -27,7 +27,7 @@ def require_extra(module: str, extra: str, asked_by: str) -> Any:
     """Return a module that one of this package's extras installs, or say how."""
     try:
         return import_module(module)
-    except ImportError as error:
+    except (ImportError, RuntimeError) as error:  # torchvision for another torch raises the latter
         package = module.partition(".")[0].replace("skimage", "scikit-image")
         raise InputError(
             f"{asked_by} needs {package}, which is not installed or does not load here ({error}). Install it with: "

@@ -2,6 +2,7 @@
 
 import sys
 from types import ModuleType, SimpleNamespace
+from unittest.mock import Mock
 from urllib.error import URLError
 
 import pytest
@@ -11,6 +12,7 @@ from torch import nn
 
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.lpips import LPIPS
+from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 
 WEIGHTS = SimpleNamespace(DEFAULT=SimpleNamespace(url="https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"))
@@ -66,6 +68,11 @@ def test_what_is_missing_is_said(torchvision, monkeypatch):
     monkeypatch.setattr(torchvision, "alexnet", offline)
     with pytest.raises(InputError, match=r"no route to host.*download https://.*7be5be79\.pth .*checkpoints"):
         Scoring(lpips="alex")
+    for_another_torch = Mock(side_effect=RuntimeError("operator torchvision::nms does not exist"))
+    with monkeypatch.context() as patch:
+        patch.setattr(errors, "import_module", for_another_torch)
+        with pytest.raises(InputError, match=r"does not load here \(operator torch"):
+            Scoring(lpips="alex")
     monkeypatch.setitem(sys.modules, "torchvision.models", None)
     with pytest.raises(InputError, match=r"evaluation.lpips=vgg needs torchvision.*pip install '.\[lpips\]'"):
         Scoring(lpips="vgg")
