@@ -50,8 +50,8 @@ LARGE, LARGE_CELLS = "fast_large", 1024
 SHORT_STEPS, LARGE_STEPS, LARGE_TABLE = 576, 1024, 20
 """For large pictures of a scene in a box: steps across it, and log2 of a hash table's entries.
 
-After 300 s, Lego (800 x 800, 12 test views) has 33.82 dB with 1024 steps, and 33.53 dB with 576 (docs/defaults.md); after
-100 s 31.83 dB with 576, and 31.19 dB with 384.
+After 300 s, Lego (800 x 800, 12 test views) has 33.82 dB with 1024 steps, and 33.53 dB with 576 (docs/defaults.md);
+after 100 s 31.83 dB with 576, and 31.19 dB with 384.
 """
 GPU_BATCHES = {
     "fast": {"data.batch_rays": 65_536, "data.sample_budget": 1 << 18},
