@@ -138,6 +138,7 @@ PLANTED = [
     "scene.masks=../../etc",
     "scene.masks=masks/../../etc",
     "scene.masks={a:['~/secret']}",
+    "path.file='C:\\keys.yaml'",
     # Numbers that are none.
     "optimizer.lr=nan",
     "optimizer.betas=[0.9,-inf]",

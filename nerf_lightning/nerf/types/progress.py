@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 SIZES_PER_HALVING, HALVINGS = 4, 7
 """Of batches. Each size has a CUDA graph of its own, and what is wanted is rounded down by 8 % on average."""
 WHOLE_BLOCKS = 256
-"""Larger batches are multiples of this: kernels are compiled for rows that fill their blocks."""
+"""Larger batches are multiples of this: Triton compiles kernels anew for sizes that 16 does not divide."""
 
 
 def batch_sizes(largest: int, together: int = 1) -> list[int]:
