@@ -13,11 +13,9 @@ from nerf_lightning.checkpoints.format import KEY, LIGHTNING
 from nerf_lightning.checkpoints.reading import checkpoint_of, content_to_resume, read_checkpoint
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.checkpoints.writing import write_checkpoint
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import key_of, quoted
-from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
@@ -26,11 +24,11 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.notebook.trained_model import TrainedModel
+from nerf_lightning.runs.plan_run import Run, plan_run
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard
 from nerf_lightning.training.callbacks.nan_guard import CURE, NanGuard
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.restore import loops_after, require_resumable, restore_run
-from nerf_lightning.training.run import Run, assemble
 from nerf_lightning.training.step_guard import first_not_finite
 
 OF_LIGHTNINGS_TRAINER = {
@@ -196,14 +194,10 @@ def build_run(
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
     chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
-    config = with_longest(config, overrides, settings.device_type == "cuda", chosen_before)
-    scene = build(config.scene).read() if scene is None else scene
-    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
     config.budget.seconds = None  # Lightning's Trainer, or `steps`, ends it
-    config, choices = resolve_auto(config, choices, overrides, scene, settings.device_type)
-    config, choices = resolve_correction(config, choices, overrides, former=chosen_before)
-    guards = config.callbacks.collapse_guard, config.callbacks.nan_guard
-    run = StepwiseRun(*vars(assemble(config, choices, settings, scene, model, loss)).values(), *map(build, guards))
+    planned = plan_run(config, choices, overrides, settings, scene, chosen_before, model, loss)
+    guards = planned.config.callbacks
+    run = StepwiseRun(**vars(planned), collapse_guard=build(guards.collapse_guard), nan_guard=build(guards.nan_guard))
     settings.prepare(run.system.model)
     run.system.record["precision"] = settings.precision
     if former is not None:

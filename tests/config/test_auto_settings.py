@@ -319,7 +319,7 @@ def test_a_new_run_knows_of_no_former_one_and_what_is_neither_a_switch_nor_auto_
 
 def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
     found = [Check("exposure", "look", "one differs")]
-    monkeypatch.setattr("nerf_lightning.commands.train_job.build.require_sound", lambda scene: found)
+    monkeypatch.setattr("nerf_lightning.runs.plan_run.require_sound", lambda scene: found)
     monkeypatch.setattr("nerf_lightning.data.bricks.reader.BricksReader.read", lambda reader: IN_A_BOX)
     for doctor, learnt in (("on", True), ("off", False)):
         overrides = [*FAST, f"doctor={doctor}", "trainer.precision=32-true"]

@@ -11,15 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
-from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import quoted
-from nerf_lightning.doctor.check import Check
-from nerf_lightning.doctor.gate import exposure_finding, require_sound
-from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.plan_run import Run, plan_run
 from nerf_lightning.runs.resume import former_config
 from nerf_lightning.runs.run_folder import job_folder
 from nerf_lightning.runs.sweep_job import stop_file
@@ -31,17 +28,12 @@ from nerf_lightning.training.callbacks.training_time import TrainingTime
 from nerf_lightning.training.launch.processes import require_one_task
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.loggers import WeightsAndBiases
-from nerf_lightning.training.run import Run, assemble
 
 
 @dataclass
 class TrainJob(Run):
     """What `nerf train` adds, but for its place on the disk."""
 
-    config: DictConfig
-    """Nothing in it is left open."""
-    checks: list[Check] | None
-    """What the doctor says of the scene, where it was asked."""
     num_steps: int
     signals: StopSignals
     clock: TrainingTime
@@ -84,17 +76,11 @@ def assemble_job(
     for each in loggers.values() if ranks.is_first() else ():
         if isinstance(each, WeightsAndBiases):
             each.require_access()
-    asked = with_longest(asked, overrides, settings.device_type == "cuda", former)
-    scene = build(asked.scene).read() if scene is None else scene
-    post_training.require_film(scene)
-    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
-    config, picked = resolve_auto(asked, choices, overrides, scene, settings.device_type, former)
-    settings.max_steps = config.trainer.max_steps
+    run = plan_run(asked, choices, overrides, settings, scene, former)
+    config = run.config
+    post_training.require_film(run.scene)
     if post_training.scoring is not None:
         post_training.scoring.max_views = config.evaluation.max_views
-    checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
-    config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
-    run = assemble(config, picked, settings, scene)
     post_training.require_density(run.system.model)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     signals, clock = StopSignals(), TrainingTime()
@@ -102,8 +88,6 @@ def assemble_job(
         say(*OmegaConf.to_yaml(config, resolve=True).splitlines())
     return TrainJob(
         **vars(run),
-        config=config,
-        checks=checks,
         num_steps=settings.num_steps(num_rays, data.batch_rays, data.crop_steps),
         signals=signals,
         clock=clock,

@@ -22,9 +22,8 @@ from rich.table import Table
 from nerf_lightning.commands.train_job.build import typed_overrides
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
-from nerf_lightning.config.auto_settings import fit_model, takes_distances, with_longest
+from nerf_lightning.config.auto_settings import fit_model
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.doctor.triangulation import with_distances
 from nerf_lightning.extensions.bench.kernels import compared_kernels
 from nerf_lightning.extensions.bench.prepared import Bench, prepare
 from nerf_lightning.extensions.bench.stages import (
@@ -38,6 +37,7 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StdoutConsole, say_written, stderr_console
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.plan_run import read_scene
 
 Work = Callable[[], Any]
 Rows = dict[str, Float[np.ndarray, "rounds"]]
@@ -77,9 +77,7 @@ def _settled(config: DictConfig) -> tuple[DictConfig, Scene]:
     """Return the config with what is chosen for its scene, and the scene."""
     choices, overrides = HydraConfig.get().runtime.choices, typed_overrides()
     on_gpu = build(config.trainer).device_type == "cuda"
-    config = with_longest(config, overrides, on_gpu, former=None)
-    scene = build(config.scene).read()
-    scene = with_distances(scene) if takes_distances(choices, overrides, scene) else scene
+    config, scene = read_scene(config, choices, overrides, on_gpu)
     return fit_model("bench", config, choices, overrides, scene, on_gpu)[0], scene
 
 

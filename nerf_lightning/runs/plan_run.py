@@ -1,0 +1,126 @@
+"""Plan a run: read its scene, choose what its config leaves open, and build what learns.
+
+`nerf train`, `nl.train` and `nl.build_run` all plan their runs here.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.same_capture import depth_sums
+from nerf_lightning.compute import ranks
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
+from nerf_lightning.config.compose import chosen
+from nerf_lightning.config.instantiate import build, required_path
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.pixels.decoded_photographs import photograph_hashes
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.gate import exposure_finding, require_sound
+from nerf_lightning.doctor.triangulation import with_distances
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.build_step import build_step
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Run:
+    """What learns, and from what."""
+
+    config: DictConfig
+    """Nothing in it is left open."""
+    settings: TrainerSettings
+    scene: Scene
+    checks: list[Check] | None
+    """What the doctor says of the scene; None: `doctor=false`."""
+    data: RayDataModule
+    system: RadianceFieldSystem
+
+
+def plan_run(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    settings: TrainerSettings,
+    scene: Scene | None = None,
+    former: Mapping[str, Any] | None = None,
+    model: Model | None = None,
+    loss: Loss | None = None,
+) -> Run:
+    """Read the scene, choose what the config leaves open, examine the capture, and build; nothing is written.
+
+    Args:
+        config: as it was composed.
+        choices: the names picked from each group, which checkpoints keep.
+        overrides: what the config was composed with.
+        settings: of the machine.
+        scene: one in the place of the config's.
+        former: the config of the run to resume, whose choices are kept; None: the run is new.
+        model: one in the place of the config's.
+        loss: the same.
+
+    Raises:
+        InputError: anything in the config or in the capture that makes no run.
+    """
+    on_gpu = settings.device_type == "cuda"
+    config, scene = read_scene(config, choices, overrides, on_gpu, scene, former)
+    config, picked = resolve_auto(config, choices, overrides, scene, settings.device_type, former)
+    settings.max_steps = config.trainer.max_steps
+    checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
+    config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
+    data, system = _built(config, picked, settings, scene, model, loss)
+    return Run(config, settings, scene, checks, data, system)
+
+
+def read_scene(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    on_gpu: bool,
+    scene: Scene | None = None,
+    former: Mapping[str, Any] | None = None,
+) -> tuple[DictConfig, Scene]:
+    """Return the config with the size of the photographs, and the scene, with distances where the loss needs them."""
+    config = with_longest(config, overrides, on_gpu, former)
+    scene = build(config.scene).read() if scene is None else scene
+    return config, with_distances(scene) if takes_distances(choices, overrides, scene) else scene
+
+
+def _built(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    settings: TrainerSettings,
+    scene: Scene,
+    model: Model | None,
+    loss: Loss | None,
+) -> tuple[RayDataModule, RadianceFieldSystem]:
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
+    record = make_record(scene, text, chosen(choices))
+    record["pixels"] = ranks.from_first(lambda: photograph_hashes(scene.pixels))
+    progress = Progress()
+    start = None
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+    train_step = build_step(config, settings, scene, progress, start, model, loss)
+    if start is not None:
+        log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
+    loss = train_step.objective.loss
+    if loss.depth_every:
+        record["depths"] = depth_sums(scene)
+    train_step.new_optimizer()  # what it refuses is refused before a folder is taken
+    data = build(config.data)(
+        scene=scene, progress=progress, seed=config.seed, patch=loss.patch, depth_every=loss.depth_every
+    )
+    if ranks.is_first():
+        build(config.quick_checks)(scene)
+    return data, RadianceFieldSystem(train_step, record, config.resume_changed_capture)
