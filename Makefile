@@ -81,7 +81,7 @@ test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where to
 test-nerfbaselines: ## Run the tests of the method in NerfBaselines; skipped where that cannot be installed
 	@$(MAKE) --no-print-directory nerfbaselines \
 		|| { echo "make: test-nerfbaselines is skipped: NerfBaselines cannot be installed here (see pip's message above)"; exit 0; }; \
-	$(NERFBASELINES_VENV)/bin/python -m pytest tests/adapters
+	$(NERFBASELINES_VENV)/bin/python -m pytest nerf_lightning/extensions/nerfbaselines
 
 nerfbaselines: $(NERFBASELINES_VENV)/.ready ## Make an environment for NerfBaselines, .venv-nerfbaselines: it wants numpy 1
 $(NERFBASELINES_VENV)/.ready: pyproject.toml constraints/torch.txt

@@ -3,6 +3,9 @@
 import sys
 from pathlib import Path
 
+from docutils import nodes
+from latex2mathml.converter import convert
+
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
@@ -10,9 +13,12 @@ import settings_page  # noqa: E402
 import site_pages  # noqa: E402
 
 project = html_title = "nerf_lightning"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx_copybutton"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+# Formulas are MathML, which browsers show without a network.
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_show_copyright = False
+html_extra_path = ["llms.txt"]
 exclude_patterns = ["_build", "README.md"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
@@ -32,6 +38,19 @@ settings_page.write(HERE)
 site_pages.write()
 
 
+def inline_math(page, node):
+    """Write a formula in a line of text."""
+    page.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def display_math(page, node):
+    """Write a formula on a line of its own."""
+    page.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app):
-    """Make links between documents links within the site."""
+    """Make links between documents links within the site, and formulas MathML."""
+    app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
     app.connect("source-read", lambda app, page, text: text.__setitem__(0, site_pages.within_site(text[0], HERE)))

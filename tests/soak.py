@@ -58,7 +58,7 @@ def one_round(folder: Path, cache: Path) -> None:
 
 
 def grows(resident: list[float], files: list[int]) -> str | None:
-    """Tell what the rounds after the warm-up have left behind, if anything."""
+    """Return what the rounds after the warm-up have left behind, if anything."""
     resident, files = resident[WARM_UP:], files[WARM_UP:]
     if len(resident) < 2:
         return None

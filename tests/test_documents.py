@@ -27,6 +27,8 @@ PAGES = [ROOT / "docs" / page for page in re.findall(r"\]\((\w+\.md)\)", INDEX)]
 DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
+    ROOT / "AGENTS.md",
+    ROOT / "docs" / "llms.txt",
     ROOT / "docs" / "README.md",
     *PAGES,
     *sorted((ROOT / "nerf_lightning" / "extensions").glob("*/README.md")),
@@ -242,12 +244,14 @@ def test_files_of_the_table_of_tasks_are_there():
 
 @pytest.mark.minutes
 def test_the_site_is_built_without_a_warning(tmp_path):
-    for needed in ("furo", "myst_nb", "sphinx_copybutton"):
+    for needed in ("furo", "myst_nb", "sphinx_copybutton", "latex2mathml"):
         pytest.importorskip(needed)
     build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "method.html").is_file()
+    method = (tmp_path / "method.html").read_text(encoding="utf-8")
+    assert method.count("<math ") > 10
+    assert not re.findall(r'(?:src|<link[^>]* href)="https?://[^"]*', method), "nothing is loaded from elsewhere"
     assert "data.sample_budget" in (tmp_path / "settings.html").read_text(encoding="utf-8")
     assert "nerf_lightning.TrainedModel" in (tmp_path / "api.html").read_text(encoding="utf-8")
 

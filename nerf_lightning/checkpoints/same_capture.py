@@ -104,7 +104,7 @@ def _names(old: tuple[str, ...], new: tuple[str, ...], in_order: bool) -> list[s
 def _moved(
     old: Mapping[str, Any], new: Mapping[str, Any], a: Int[Tensor, "views"], b: Int[Tensor, "views"]
 ) -> Bool[Tensor, "views"]:
-    """Tell which poses differ in the user's frame; one that does moves the working frame, and all others in it."""
+    """Return which poses differ in the user's frame; one that does moves the working frame, and all others in it."""
     was = old["cameras"]["c2w"].double()
     apart = torch.linalg.inv(new["to_user"].double()) @ old["to_user"].double()
     now = poses_from_user(new["cameras"]["c2w"].double(), apart)

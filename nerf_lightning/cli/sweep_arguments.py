@@ -19,7 +19,7 @@ JOB_FOLDER = "hydra.sweep.subdir"
 
 
 def is_sweep(arguments: list[str]) -> bool:
-    """Tell whether the arguments ask for many runs."""
+    """Return whether the arguments ask for many runs."""
     return bool(set(FLAGS) & set(arguments))
 
 

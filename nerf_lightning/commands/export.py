@@ -17,7 +17,7 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.export.base import Export, Neutral, PageExtras
+from nerf_lightning.export.base import Export, Neutral, RunContext
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError
@@ -33,8 +33,8 @@ from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.recorded_path import RecordedPath
 from nerf_lightning.video.shots import Subject, content_of, frame_around
-from nerf_lightning.viewer.recorded_path import RecordedPath
 
 Keyframes = tuple[dict[str, Any], ...]
 
@@ -72,20 +72,20 @@ def write_files(
     """Export an opened model into a folder, which is there, and return the files."""
     record = opened.checkpoint.scene
     content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
-    what.beside = beside(opened, photographs, path if what.plays_path else None, content)
+    run = run_context(opened, photographs, path if what.plays_path else None, content)
     if opened.model.needs_photographs:
         record = scene_record(scene_to_look_at(opened, None))
     with torch.no_grad():
-        return what.export(opened.model, record, folder, opened.tile_points)
+        return what.export(opened.model, record, folder, opened.tile_points, run)
 
 
-def beside(
+def run_context(
     opened: LoadedModel,
     photographs: Scene | None,
     path: CameraPath | None,
     content: Content,
-) -> PageExtras:
-    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path."""
+) -> RunContext:
+    """Return what is known of a checkpoint's run: its photographs, its metrics, and a camera path."""
     checkpoint = opened.checkpoint
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
@@ -97,7 +97,7 @@ def beside(
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None
     keyframes = () if path is None else page_path(path, checkpoint.scene, run, content)
     name = scene_name({"scene": checkpoint.scene.name}, checkpoint.choices, read_run(run).overrides)
-    return PageExtras(photographs, neutral, tuple(known), keyframes, name)
+    return RunContext(photographs, neutral, tuple(known), keyframes, name)
 
 
 def neutral_colors(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Neutral:

@@ -60,12 +60,12 @@ def suited(precision: Chosen, reason: str, device_type: DeviceType, model: Model
 
 
 def has_native_bfloat16(device_type: str) -> bool:
-    """Tell whether the device multiplies bfloat16 matrices in hardware."""
+    """Return whether the device multiplies bfloat16 matrices in hardware."""
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return cpu_multiplies_bfloat16() if device_type == "cpu" else device_type == "xla"
 
 
 def has_tf32(device_type: str) -> bool:
-    """Tell whether the device multiplies matrices in TensorFloat-32."""
+    """Return whether the device multiplies matrices in TensorFloat-32."""
     return device_type == "cuda" and torch.cuda.get_device_capability() >= (8, 0)

@@ -30,7 +30,7 @@ def rank() -> int:
 
 
 def is_first() -> bool:
-    """Tell whether this process speaks and writes for all."""
+    """Return whether this process speaks and writes for all."""
     return rank() == 0
 
 

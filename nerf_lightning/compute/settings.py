@@ -84,7 +84,8 @@ class ComputeSettings:
 
     def describe(self) -> str:
         """Say device and precision, with the reason where they were chosen."""
-        threads = f", {torch.get_num_threads()} threads" if self.device_type == "cpu" else ""
+        count = torch.get_num_threads()
+        threads = f", {count} thread{'s' * (count != 1)}" if self.device_type == "cpu" else ""
         processes = f"{ranks.world_size()} processes, each " if ranks.world_size() > 1 else ""
         return f"{processes}{self.device_type}{threads} ({self.device_reason}), {self.precision} ({self.reason})"
 

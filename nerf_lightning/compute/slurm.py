@@ -22,7 +22,7 @@ def num_tasks() -> int:
 
 
 def was_requeued() -> bool:
-    """Tell whether Slurm has started this job before."""
+    """Return whether Slurm has started this job before."""
     return slurm_job() is not None and os.environ.get("SLURM_RESTART_COUNT", "0") not in ("", "0")
 
 

@@ -79,7 +79,7 @@ def with_longest(
 
 
 def takes_distances(choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene) -> bool:
-    """Tell whether a run learns from known distances: with loss=depth, which model=auto chooses for photographs."""
+    """Return whether a run learns from known distances: with loss=depth, which model=auto chooses for photographs."""
     if "loss" in map(key_of, overrides) or choices.get("model") != AUTO:
         return choices.get("loss") == "depth"
     return model_for(scene)[0] == PHOTOGRAPHS

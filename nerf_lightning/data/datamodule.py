@@ -118,7 +118,7 @@ class RayDataModule(LightningDataModule):
         self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
 
     def fits(self, device: torch.device) -> bool:
-        """Tell whether the pixels are to move to a device."""
+        """Return whether the pixels are to move to a device."""
         return device.type != "cpu" and num_bytes(self.scene.pixels) <= budget_bytes(self.device_budget, device)
 
     def train_dataloader(self) -> RayBatches:

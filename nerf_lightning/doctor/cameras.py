@@ -124,9 +124,9 @@ def principal_point(evidence: Given) -> Check:
     size = torch.stack([cameras.width, cameras.height], dim=-1)
     share = cameras.center / size
     off = float((share - 0.5).abs().max())
-    message = f"at most {100 * off:.1f} % of the size from the center"
+    message = f"up to {100 * off:.1f} % of the size away from the center"
     if off < OFF_CENTER:
-        return ok(message)
+        return ok("centered" if off < 0.0005 else message)
     usual = share.median(dim=0).values
     factor = float((usual / 0.5).mean())
     # Photographs that were cropped, each elsewhere, have it anywhere; numbers for another size have it so in all.
@@ -227,8 +227,8 @@ def coverage(evidence: Evidence) -> Check:
         at = (float(around[place]) + widest / 2 + 180) % 360 - 180
         before, after = (scene.view_names[view] for view in azimuth.argsort().roll(-place)[:2].tolist())
         cure = (
-            f"Take {math.ceil(widest / STEP)} more photographs between where {before} and {after} were taken, around "
-            f"{at:.0f} degrees on the coverage map (in the report, and in the doctor's doctor.png)."
+            f"Take {math.ceil(widest / STEP)} more photographs between {before} and {after} "
+            f"({at:.0f} degrees on the coverage map of the report or of doctor.png)."
         )
         return look(f"{message}, with a gap of {widest:.0f} degrees", cure)
     return ok(message)
@@ -244,7 +244,7 @@ def _degrees_to_nearest(scene: Scene, held: list[int], train: list[int]) -> Floa
 
 CHECKS = {
     "rotations": rigid,
-    "common middle": common_middle,
+    "camera directions": common_middle,
     "upright": upright,
     "field of view": field_of_view,
     "principal point": principal_point,

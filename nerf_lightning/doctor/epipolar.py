@@ -11,7 +11,7 @@ TOLERANCE = 1.5  # Pixels of the shrunk pictures
 
 
 def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:
-    """Tell which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
+    """Return which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
 
     Focal lengths are multiplied by `zoom`.
     """

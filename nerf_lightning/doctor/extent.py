@@ -87,7 +87,7 @@ def _in_pictures(scene: Scene) -> tuple[Tensor, Float[Tensor, "content"]] | None
 
 
 def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
-    """Tell which matches say where in the world they lie."""
+    """Return which matches say where in the world they lie."""
     return evidence.agrees & (parallax(evidence.matches, evidence.scene.cameras.c2w) > LEAST_PARALLAX)
 
 
@@ -168,4 +168,4 @@ def _units(low: float, high: float, near: float, far: float) -> str:
     return ""
 
 
-CHECKS = {"near and far": near_and_far, "box in view": box_in_view, "scale": scale}
+CHECKS = {"near and far": near_and_far, "scene box": box_in_view, "scale": scale}

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 QUICK: dict[str, Callable[[Given], Check]] = {
     "rotations": cameras.rigid,
-    "common middle": cameras.common_middle,
+    "camera directions": cameras.common_middle,
     "field of view": cameras.field_of_view,
     "principal point": cameras.principal_point,
     "number of views": cameras.number_of_views,
@@ -44,7 +44,7 @@ def require_sound(scene: Scene) -> list[Check]:
     unknown = [check.name for check in checks if check.verdict == "not judged"]
     left = f"; not judged: {', '.join(unknown)}" if unknown else ""
     count = len(checks) - len(unknown)
-    log.info("doctor: %d checks found no problem%s (doctor=off skips them)", count, left)
+    log.info("doctor: %d checks found no problem%s (doctor=off skips all checks)", count, left)
     return checks
 
 

@@ -93,7 +93,7 @@ def exposure(evidence: Evidence) -> Check:
     dark, odd = _jumps(bright, EXPOSURE), _jumps(tint, TINT)
     if not dark and not odd:
         spread = float(torch.maximum(bright, 1 / bright).max())
-        return ok(f"brightness of the same details differs by {spread:.2f} times at most")
+        return ok(f"brightness of the same details differs by a factor of at most {spread:.2f}")
     words = []
     if dark:
         words.append(f"{evidence.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")

@@ -248,7 +248,7 @@ CHECKS: dict[str, CheckFn] = {
     "axes": partial(best_reading, readings=AXES, fine="the cameras' axes are right, up, back, camera to world"),
     "mirrored photographs": partial(best_reading, readings=PHOTOGRAPHS, fine="the photographs are not mirrored"),
     "order of photographs": partial(best_reading, readings=ORDERS, fine="each photograph has its own pose"),
-    "poses and pixels": poses_and_pixels,
+    "poses match photographs": poses_and_pixels,
     "single poses": single_poses,
     "focal length": focal_length,
 }

@@ -53,7 +53,7 @@ class BetterPose:
 
 
 def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
-    """Tell whether the views that stand nearest, of `others` that nothing is said against, agree with a view."""
+    """Return whether the views that stand nearest, of `others` that nothing is said against, agree with a view."""
     c2w = evidence.scene.cameras.c2w
     known = torch.tensor([other for other in others if other in evidence.corners], dtype=torch.long)
     pairs = [(view, other) for other in nearest_views(c2w, torch.tensor([view]), known, NEAREST)[0].tolist()]

@@ -52,7 +52,7 @@ def color_corrected(
 
 
 def is_one_color(picture: Float[Tensor, "height width 3"], kept: Bool[Tensor, "height width"] | None = None) -> bool:
-    """Tell whether the pixels that count, if any, differ by less than half a level of 255 in every channel."""
+    """Return whether the pixels that count, if any, differ by less than half a level of 255 in every channel."""
     colors = picture.reshape(-1, 3) if kept is None else picture[kept]
     return not len(colors) or bool((colors.amax(dim=0) - colors.amin(dim=0) < HALF_A_LEVEL).all())
 

@@ -22,8 +22,8 @@ Neutral = Callable[[Float[Tensor, "height width 3"], str], Float[Tensor, "height
 
 
 @dataclass(frozen=True)
-class PageExtras:
-    """What belongs to a checkpoint and is not in it."""
+class RunContext:
+    """What an exporter may need of a run beside its model: none of it is in the checkpoint."""
 
     photographs: Scene | None = None
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
@@ -37,22 +37,26 @@ class PageExtras:
     """What people call the scene; empty: as its record does."""
 
 
+MODEL_ALONE = RunContext()
+"""Nothing is known but the model."""
+
+
 class Export(ABC):
     """Write what a model has learned as files for other programs."""
 
     needs_photographs: bool = False
-    """Whether the photographs of the run are read again, and stand in `beside`; None there: they cannot be."""
+    """Whether the photographs of the run are read again (`run.photographs`; None: they cannot be)."""
     plays_path: bool = False
-    """Whether the camera path of the config stands in `beside`, as keyframes."""
+    """Whether the camera path of the config is evaluated (`run.keyframes`)."""
     needs_density: bool = True
     """Whether it says where matter is, and not only what is seen."""
     kernels: tuple[str, ...] = ()
     """Full names of modules of compiled kernels that it uses, each with a `trial`: compiled at installation."""
-    beside: PageExtras = PageExtras()
-    """What the command has found beside the checkpoint."""
 
     @abstractmethod
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write files into `folder`, which is there, and return where they are.
 
         Args:
@@ -60,6 +64,7 @@ class Export(ABC):
             record: the scene that it was trained on.
             folder: where to.
             tile_points: most points that go through a field at once.
+            run: what else is known of the run.
 
         Raises:
             InputError: a setting that makes no sense, or a model in which there is nothing to export.

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.export.base import Export, require_free
+from nerf_lightning.export.base import MODEL_ALONE, Export, RunContext, require_free
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import make_folder
@@ -49,7 +49,9 @@ class CamerasExport(Export):
 
     images: str | None = None
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the files."""
         cameras = in_user_frame(record)
         transforms, model_folder = folder / "transforms.json", folder / "sparse" / "0"
@@ -139,7 +141,7 @@ def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
 
 
 def _is_whole(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which panoramas show all directions, as COLMAP's EQUIRECTANGULAR camera (4.1 or later) does."""
+    """Return which panoramas show all directions, as COLMAP's EQUIRECTANGULAR camera (4.1 or later) does."""
     size = torch.stack([cameras.width, cameras.height], dim=-1).double()
     turns = torch.tensor([2.0, 1.0], dtype=torch.float64) * math.pi
     return ((cameras.focal.double() * turns - size).abs() < WHOLE * size).all(dim=-1)

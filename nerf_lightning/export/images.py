@@ -12,7 +12,7 @@ from numpy import ndarray
 from PIL import Image
 
 from nerf_lightning.data.pixels.picture_files import ENDINGS
-from nerf_lightning.export.base import Export, require_free, require_setting
+from nerf_lightning.export.base import MODEL_ALONE, Export, RunContext, require_free, require_setting
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
@@ -59,7 +59,9 @@ class ImagesExport(Export):
         some = self.max_views is None or self.max_views >= 1
         require_setting("max_views", self.max_views, some, "give at least one view, or null for all.")
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
         require_free(files=[folder / "images.json"], folders=[folder / name for name in KINDS])
         views = self._views(record)

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_html
+
+SCENE_PAGE = b"<!-- nerf_lightning page 1 -->"
+"""How the page of a scene begins (`nerf export what=page`)."""
 
 
 def rendered(template: Path, **values: Any) -> str:
@@ -30,12 +36,27 @@ def write_page(template: Path, target: Path, **values: Any) -> None:
         part.write_text(page, encoding="utf-8")
 
 
+def is_scene_page(path: Path) -> bool:
+    """Return whether a file begins as our page of a scene does."""
+    try:
+        with open_regular(path, None) as file:
+            return SCENE_PAGE in file.read(200)
+    except InputError:
+        return False
+
+
 def own_policy(script: str, style: str) -> str:
     """Return the content security policy of a page with one script and one style, and pictures and films within it."""
     return (
         f"default-src 'none'; img-src data:; media-src data:; script-src '{_digest(script)}'; "
         f"style-src '{_digest(style)}'; base-uri 'none'; form-action 'none'"
     )
+
+
+def json_in_page(value: Any) -> Markup:
+    """Return a value as JSON for an element of a page: nothing of it ends the element."""
+    text = json.dumps(value, allow_nan=False)
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def data_address(kind: str, content: bytes) -> str:

@@ -123,7 +123,7 @@ class _LinearInTiles(torch.autograd.Function):
 
 @functools.cache
 def cpu_multiplies_bfloat16() -> bool:
-    """Tell whether this CPU, as far as torch is allowed to use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 itself."""
+    """Return whether this CPU, as far as torch may use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 itself."""
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     allowed = torch.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
     return allowed and any(map(_cpu_says, probes))
@@ -131,7 +131,7 @@ def cpu_multiplies_bfloat16() -> bool:
 
 @functools.cache
 def cpu_gains_by_bfloat16() -> bool:
-    """Tell whether torch multiplies wide matrices faster in bfloat16 than in float32 on this CPU.
+    """Return whether torch multiplies wide matrices faster in bfloat16 than in float32 on this CPU.
 
     With AMX it does, and on AMD's. Intel's AVX512-BF16 alone is slower than its float32 (221 for 331 GFLOP/s at 256 x
     256); kernels of our own, which keep activations in registers, gain there all the same.

@@ -1,27 +1,22 @@
-"""Curves of a run, read from its TensorBoard files and drawn (SVG) for a page."""
+"""Curves of a run, read from its TensorBoard files for a page, whose script draws them."""
 
-import io
 import logging
 import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from nerf_lightning.files.budgets import require_within
-from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.visualization.figures import new_figure
 
 Curve = tuple[Sequence[int], Sequence[float]]  # Steps and values
-WIDTH, HEIGHT = 560, 320
 MOST_CURVES = 12
 """In one chart; more are not told apart, and a stranger's file may have thousands."""
-COLORS = ("#2f6db3", "#e07b39", "#3c9d6b", "#8b5fbf", "#c8372d", "#6a7280")
+DIGITS = 5
 
 
 @dataclass(frozen=True)
@@ -30,70 +25,68 @@ class Chart:
 
     label: str
     tags: re.Pattern[str]
+    """Of the curves; its one group is the curve's label."""
     is_logarithmic: bool = False
+    is_noisy: bool = False
+    """Whether a smoothed curve is drawn as well."""
 
 
 # Only names of these forms are drawn: others may be anything.
 CHARTS = (
-    Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)")),
-    Chart("loss", re.compile(r"Training loss/\w{1,40}"), is_logarithmic=True),
-    Chart("learning rate", re.compile(r"train/learning_rate"), is_logarithmic=True),
-    Chart("rays per second", re.compile(r"speed/rays_per_second")),
-    Chart("memory (GB)", re.compile(r"memory/\w{1,40}_gigabytes")),
+    Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)"), is_noisy=True),
+    Chart("Training loss", re.compile(r"Training loss/(\w{1,40})"), is_logarithmic=True, is_noisy=True),
+    Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
+    Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True),
+    Chart("Memory (GB)", re.compile(r"memory/(\w{1,40})_gigabytes")),
 )
 
 
 class Drawing(NamedTuple):
-    """A chart in a page."""
+    """A chart in a page, which the page's script draws."""
 
     label: str
-    address: str
+    is_logarithmic: bool
+    is_noisy: bool
+    curves: list[dict[str, Any]]
+    """Each with its `label`, `steps` and `values`."""
     note: str
     """What of it is not drawn; empty: all is."""
 
 
 def curve_drawings(curves: Mapping[str, Curve]) -> list[Drawing]:
-    """Return the charts that there is something to draw in."""
+    """Return the charts that there is something to draw in: a curve of at least two points."""
     drawings = []
     for chart in CHARTS:
-        drawn = {tag: _finite(curve, chart) for tag, curve in sorted(curves.items()) if chart.tags.fullmatch(tag)}
-        drawn = {tag: curve for tag, curve in drawn.items() if curve[0]}
+        matched = {tag: match[1] for tag in sorted(curves) if (match := chart.tags.fullmatch(tag))}
+        labels = _labels(matched)
+        finite = {tag: _finite(curves[tag], chart) for tag in matched}
+        drawn = [
+            {"label": labels[tag], "steps": steps, "values": values}
+            for tag, (steps, values) in finite.items()
+            if len(steps) > 1
+        ]
         if drawn:
-            first, more = dict(islice(drawn.items(), MOST_CURVES)), len(drawn) - MOST_CURVES
+            more = len(drawn) - MOST_CURVES
             note = f"{more} more curves are in the run's TensorBoard files." if more > 0 else ""
-            drawings.append(Drawing(chart.label, data_address("image/svg+xml", _draw(chart, first)), note))
+            shown = drawn[:MOST_CURVES]
+            drawings.append(Drawing(chart.label, chart.is_logarithmic, chart.is_noisy, shown, note))
     return drawings
+
+
+def _labels(names: Mapping[str, str]) -> dict[str, str]:
+    """Return what each curve is called: `train_fine` is "training", or, of several levels, "training (fine)"."""
+    levels = [name for name in names.values() if name.startswith("train_")]
+    training = {name: "training" if len(levels) == 1 else f"training ({name[6:]})" for name in levels}
+    return {tag: training.get(name, name.replace("_", " ")) for tag, name in names.items()}
 
 
 def _finite(curve: Curve, chart: Chart) -> Curve:
     kept = [
-        (step, value)
+        (step, float(f"{value:.{DIGITS}g}"))
         for step, value in zip(*curve, strict=True)
         if math.isfinite(value) and (value > 0 or not chart.is_logarithmic)
     ]
     return [step for step, _ in kept], [value for _, value in kept]
-
-
-def _draw(chart: Chart, curves: Mapping[str, Curve]) -> bytes:
-    figure = new_figure(WIDTH, HEIGHT)
-    axes = figure.subplots()
-    for number, (tag, (steps, values)) in enumerate(curves.items()):
-        marker = "o" if len(steps) < 3 else None
-        axes.plot(
-            list(steps), list(values), label=tag, color=COLORS[number % len(COLORS)], linewidth=1.4, marker=marker, ms=3
-        )
-    if chart.is_logarithmic:
-        axes.set_yscale("log")
-    axes.set_title(chart.label, fontsize=11, loc="left")
-    axes.set_xlabel("step", fontsize=9)
-    axes.grid(True, color="0.9", linewidth=0.8)
-    axes.tick_params(which="both", labelsize=8, color="0.6")
-    axes.spines[["top", "right"]].set_visible(False)
-    if len(curves) > 1:
-        axes.legend(fontsize=8, framealpha=0.9)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
 
 
 MOST_POINTS = 1000

@@ -29,7 +29,7 @@ class Embedded:
 
     @property
     def is_small(self) -> bool:
-        """Tell whether it is shown larger than it is, where blurring would hide what is to be judged."""
+        """Return whether it is shown larger than it is, where blurring would hide what is to be judged."""
         return self.width < SMALL
 
 

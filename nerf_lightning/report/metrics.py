@@ -26,7 +26,7 @@ LABELS = {
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "depth_error": "depth error, scene units",
-    "normal_error": "normal error",
+    "normal_error": "surface normals off by",
 }
 WITHOUT_LPIPS = "not computed (evaluation.lpips=alex)"
 MOST_VIEWS = 12
@@ -71,7 +71,7 @@ def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     """Return protocol, origin and environment as pairs of texts."""
-    titles = {"protocol": "Protocol", "origin": "Whose numbers these are", "environment": "Environment"}
+    titles = {"protocol": "Protocol", "origin": "Provenance", "environment": "Environment"}
     told = {key: list(mapping(metrics.get(key)).items())[:MOST_PAIRS] for key in titles}
     pairs = {key: [(name.replace("_", " ")[:80], _said(value)) for name, value in found] for key, found in told.items()}
     if pairs["protocol"] and metrics.get("lpips") is None:
@@ -88,6 +88,7 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
     spread = [(picture_name(split, name), name) for name in map(str, _sequence(metrics.get("pictures")))][:MOST_VIEWS]
     missing: list[str] = []
     pages: list[list[ViewOnPage]] = []
+    spread = [(folder, name) for folder, name in spread if name not in worst]  # shown once
     for folders in (named, spread):
         pages.append([])
         for folder, name in folders:

@@ -13,10 +13,146 @@ for (const figure of document.querySelectorAll(".steps")) {
   show();
 }
 
-// Truth and render on top of each other: what lies left of the line is truth.
+// Photograph and render on top of each other: left of the line is the photograph.
 for (const figure of document.querySelectorAll(".wipe")) {
   const slider = figure.querySelector("input");
   const move = () => figure.style.setProperty("--at", slider.value + "%");
   slider.addEventListener("input", move);
   move();
 }
+
+// Color and depth of the same film play in step.
+const films = [...document.querySelectorAll(".films video")].slice(0, 2);
+for (const film of films) {
+  const others = films.filter(other => other !== film);
+  const follow = () => others.forEach(other => {
+    if (Math.abs(other.duration - film.duration) > 0.1) return;
+    if (Math.abs(other.currentTime - film.currentTime) > 0.08) other.currentTime = film.currentTime;
+  });
+  film.addEventListener("play", () => others.forEach(other => other.paused && other.play()));
+  film.addEventListener("pause", () => others.forEach(other => other.pause()));
+  film.addEventListener("seeking", follow);
+}
+films[0]?.addEventListener("timeupdate", () => {
+  if (films[1] && Math.abs(films[1].currentTime - films[0].currentTime) > 0.25) films[1].currentTime = films[0].currentTime;
+});
+
+// Charts: each curve, smoothed where it is noisy, and the values at the pointer.
+const COLORS = ["#2f6db3", "#e07b39", "#3c9d6b", "#8b5fbf", "#c8372d", "#6a7280"];
+const HEIGHT = 260, LEFT = 56, RIGHT = 10, TOP = 8, BOTTOM = 34, SMOOTHING = 0.9;
+
+function put(parent, name, attributes, text = "") {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.textContent = text;
+  return parent.appendChild(made);
+}
+
+// An exponential moving average without the bias of its start.
+function smoothed(values) {
+  let sum = 0, weight = 0;
+  return values.map(value => {
+    sum = SMOOTHING * sum + (1 - SMOOTHING) * value;
+    weight = SMOOTHING * weight + (1 - SMOOTHING);
+    return sum / weight;
+  });
+}
+
+function ticks(low, high, count) {
+  const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * [1, 2, 5, 10].find(factor => factor * power >= rough);
+  const found = [];
+  for (let k = Math.ceil(low / step); k * step <= high * (1 + 1e-9); ++k) found.push(k * step);
+  return found;
+}
+
+function logarithmic(low, high) {
+  const decades = high - low, found = [];
+  for (let power = Math.floor(low); power <= high; ++power)
+    for (const factor of decades < 2 ? [1, 2, 5] : [1]) {
+      const value = power + Math.log10(factor);
+      if (value >= low && value <= high) found.push(value);
+    }
+  return found.filter((_, number) => number % Math.ceil(found.length / 6) === 0);
+}
+
+const short = value => {
+  const size = Math.abs(value);
+  if (size >= 1e6) return +(value / 1e6).toPrecision(3) + "M";
+  if (size >= 1e4) return +(value / 1e3).toPrecision(3) + "k";
+  return size !== 0 && size < 1e-3 ? value.toExponential(0) : String(+value.toPrecision(3));
+};
+
+function draw(figure, chart) {
+  const place = figure.querySelector("div"), label = figure.querySelector("output");
+  const width = place.clientWidth, scaled = chart.is_logarithmic ? Math.log10 : value => value;
+  const back = chart.is_logarithmic ? value => 10 ** value : value => value;
+  const curves = chart.curves.map(({label, steps, values}) => {
+    const raw = values.map(scaled);
+    return {label, steps, values, raw, line: chart.is_noisy && raw.length > 20 ? smoothed(raw) : raw};
+  });
+  const first = Math.min(...curves.map(curve => curve.steps[0]));
+  const last = Math.max(...curves.map(curve => curve.steps.at(-1)));
+  // One outlier does not flatten all the rest.
+  const all = curves.flatMap(curve => curve.raw).sort((a, b) => a - b);
+  let low = all[Math.floor(0.005 * all.length)], high = all[Math.ceil(0.995 * all.length) - 1];
+  const margin = 0.05 * (high - low) || 0.05 * Math.abs(high) || 1;
+  low -= margin; high += margin;
+  const x = step => LEFT + (step - first) / (last - first) * (width - LEFT - RIGHT);
+  const y = value => TOP + (high - Math.min(high, Math.max(low, value))) / (high - low) * (HEIGHT - TOP - BOTTOM);
+
+  place.replaceChildren();
+  const svg = put(place, "svg", {width, height: HEIGHT, role: "img", "aria-label": chart.label});
+  for (const value of chart.is_logarithmic ? logarithmic(low, high) : ticks(low, high, 5)) {
+    put(svg, "line", {class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value)});
+    put(svg, "text", {x: LEFT - 6, y: y(value) + 4, "text-anchor": "end"}, short(back(value)));
+  }
+  for (const step of ticks(first, last, Math.max(2, width / 110)))
+    put(svg, "text", {x: x(step), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle"}, short(step));
+  put(svg, "text", {x: width - RIGHT, y: HEIGHT - 3, "text-anchor": "end"}, "step");
+  curves.forEach((curve, number) => {
+    const points = line => line.map((value, k) => `${x(curve.steps[k]).toFixed(1)},${y(value).toFixed(1)}`).join(" ");
+    const stroke = COLORS[number % COLORS.length];
+    if (curve.line !== curve.raw) put(svg, "polyline", {class: "raw", stroke, points: points(curve.raw)});
+    put(svg, "polyline", {stroke, points: points(curve.line)});
+  });
+  const cursor = put(svg, "line", {class: "cursor", y1: TOP, y2: HEIGHT - BOTTOM, visibility: "hidden"});
+
+  const say = parts => {
+    label.replaceChildren(...parts.map(([text, color]) => {
+      const span = document.createElement("span");
+      span.textContent = text;
+      span.style.color = color;
+      return span;
+    }));
+    label.classList.add("legend");
+  };
+  const legend = () => {
+    cursor.setAttribute("visibility", "hidden");
+    say(curves.length > 1 ? curves.map(({label}, number) => [label, COLORS[number % COLORS.length]]) : []);
+  };
+  const nearest = (steps, step) => steps.reduce((best, each, k) =>
+    Math.abs(each - step) < Math.abs(steps[best] - step) ? k : best, 0);
+  svg.addEventListener("pointermove", event => {
+    const step = first + (event.offsetX - LEFT) / (width - LEFT - RIGHT) * (last - first);
+    const at = curves[0].steps[nearest(curves[0].steps, step)];
+    for (const key of ["x1", "x2"]) cursor.setAttribute(key, x(at));
+    cursor.setAttribute("visibility", "visible");
+    say([[`step ${at}`, ""], ...curves.map((curve, number) => {
+      const value = curve.values[nearest(curve.steps, at)];
+      return [`${curves.length > 1 ? curve.label + " " : ""}${+value.toPrecision(4)}`, COLORS[number % COLORS.length]];
+    })]);
+  });
+  svg.addEventListener("pointerleave", legend);
+  legend();
+}
+
+const charts = JSON.parse(document.getElementById("charts")?.textContent || "[]");
+const drawAll = () => document.querySelectorAll(".chart").forEach((figure, number) => draw(figure, charts[number]));
+let drawnWidth = 0;
+new ResizeObserver(() => {
+  if (document.body.clientWidth !== drawnWidth) {
+    drawnWidth = document.body.clientWidth;
+    drawAll();
+  }
+}).observe(document.body);

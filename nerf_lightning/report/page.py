@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.files.html import write_page
+from nerf_lightning.files.html import json_in_page, write_page
 from nerf_lightning.report.curves import Drawing
 from nerf_lightning.report.embedding import Embedded
 
@@ -35,7 +35,9 @@ class Report:
     title: str
     subtitle: str = ""
     scene_page: str = ""
-    """The address of the page on which the scene can be walked around in."""
+    """The address of the page of the scene (`nerf export what=page`)."""
+    scene_page_age: str = ""
+    """What is said of a page that is older than the last checkpoint."""
     exports: Pairs = field(default_factory=list)
     """Files for other programs: label and address."""
     facts: Pairs = field(default_factory=list)
@@ -45,12 +47,14 @@ class Report:
     worst: list[ViewOnPage] = field(default_factory=list)
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
-    """Pictures of one view while it was learned."""
+    """Pictures of one view during training."""
     curves: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
     """What the doctor found."""
     coverage: Embedded | None = None
+    split: str = "test"
+    """Whose views `per_image` lists."""
     columns: list[str] = field(default_factory=list)
     per_image: list[list[str]] = field(default_factory=list)
     tables: list[tuple[str, Pairs]] = field(default_factory=list)
@@ -61,4 +65,5 @@ class Report:
 
 def write_report(report: Report, target: Path) -> None:
     """Write the report as one file of HTML."""
-    write_page(FOLDER / "page.html", target, report=report)
+    charts = [chart._asdict() for chart in report.curves]
+    write_page(FOLDER / "page.html", target, report=report, charts=json_in_page(charts))

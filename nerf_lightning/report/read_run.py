@@ -8,8 +8,8 @@ from urllib.parse import quote
 
 from nerf_lightning.checkpoints.reading import newest_checkpoint
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.export.page_file import is_page
-from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.files.html import is_scene_page
+from nerf_lightning.files.json_files import mapping, read_json_object
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
@@ -24,8 +24,10 @@ from nerf_lightning.runs.summary import read_run as read_summary
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
+SPLITS = {"train": "training", "test": "test"}
 MOST_EXPORTS = 20
-VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learned"}
+VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
+EARLIER = "of an earlier checkpoint"
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
 
 
@@ -73,7 +75,8 @@ def read_run(
         for name, label in VIDEOS.items():
             if (run / name).is_file():
                 with attempt("Film"):
-                    report.videos.append((label, embedded_video(run / name, most_video_bytes)))
+                    age = f" ({EARLIER})" if _is_older(run / name, run) else ""
+                    report.videos.append((label + age, embedded_video(run / name, most_video_bytes)))
         progress("capture", 0.0)
         with attempt("Coverage"):
             _add_coverage(report, run)
@@ -94,17 +97,23 @@ def address_from(file: Path, folder: Path) -> str:
 
 
 def _add_exports(report: Report, exported: Path, folder: Path) -> None:
-    """Link what nerf export wrote; of pages, only ours. What was written before the last checkpoint shows less."""
-    last = exported.parent / "checkpoints" / "last.ckpt"
-    since = last.stat().st_mtime if last.is_file() else 0.0
+    """Link what nerf export wrote; of pages, only ours."""
+    run = exported.parent
     files = [file for file in sorted(exported.glob("*")) if file.is_file() and file.suffix != ".html"]
     for file in files[:MOST_EXPORTS]:
-        age = "" if file.stat().st_mtime >= since else ", of an earlier checkpoint"
+        age = f", {EARLIER}" if _is_older(file, run) else ""
         size = f"{file.stat().st_size / 1e6:.2g} MB{age}"
         report.exports.append((f"{file.name} ({size})", address_from(file.absolute(), folder)))
     page = exported / "page.html"
-    if page.is_file() and page.stat().st_mtime >= since and is_page(page):
+    if page.is_file() and is_scene_page(page):
         report.scene_page = address_from(page.absolute(), folder)
+        report.scene_page_age = EARLIER if _is_older(page, run) else ""
+
+
+def _is_older(file: Path, run: Path) -> bool:
+    """Return whether a file was written before the last checkpoint of the run, and shows less."""
+    last = run / "checkpoints" / "last.ckpt"
+    return last.is_file() and file.stat().st_mtime < last.stat().st_mtime
 
 
 def _add_measured(report: Report, run: Path, file: Path) -> None:
@@ -112,6 +121,7 @@ def _add_measured(report: Report, run: Path, file: Path) -> None:
     report.subtitle = f"{run.absolute()}, started {note.get('started', 'at an unknown time')}"
     report.facts = facts(metrics, note)
     report.columns, report.per_image = per_image(metrics)
+    report.split = str(mapping(metrics.get("protocol")).get("split", "test"))[:20]
     report.tables = tables(metrics)
     if not metrics:
         report.missing.append(f"Numbers: there is no {file.relative_to(run)} that can be read.")
@@ -142,6 +152,9 @@ def _add_coverage(report: Report, run: Path) -> None:
         raise InputError(f"{run} has no checkpoint")
     record = checkpoint.scene
     name = scene_name({"scene": record.name}, checkpoint.choices, read_summary(run).overrides)
-    report.title = f"{name}, {len(record.view_names)} photographs"
-    report.subtitle = f"{checkpoint.choices.get('model', '')}, {report.subtitle}"
+    report.title = name
+    views = " and ".join(
+        f"{len(record.splits[split])} {split_name}" for split, split_name in SPLITS.items() if record.splits.get(split)
+    )
+    report.subtitle = f"{checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
     report.coverage = embedded(coverage_picture(record).numpy())

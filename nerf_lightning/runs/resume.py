@@ -92,7 +92,7 @@ def _newer_settings(folder: Path, identity: dict[str, Any], other: dict[str, Any
 
 
 def _is_as_begun(folder: Path, other: dict[str, Any]) -> bool:
-    """Tell whether the run in a folder began with what its config says now.
+    """Return whether the run in a folder began with what its config says now.
 
     Versions up to 1.0.0 counted the budget to a run's identity.
     """
@@ -141,7 +141,7 @@ def newest_unfinished(root: Path, digest: str, length: tuple[int, float | None],
 
 
 def _is_over(note: Mapping[str, Any], num_steps: int, seconds: float | None) -> bool:
-    """Tell whether a run has finished and would take no further step with so many steps and seconds."""
+    """Return whether a run has finished and would take no further step with so many steps and seconds."""
     finished, used = number(note.get("finished_at_step")), number(note.get("budget_seconds"))
     if finished is None:
         return False

@@ -47,7 +47,7 @@ def print_rows(rows: list[Row], title: str, elsewhere: str) -> None:
     say("")
     left_out = [name for name in columns if name not in fitting]
     if left_out:
-        say(f"The terminal is too narrow for more columns ({listed(left_out, cap=20)}). {elsewhere}")
+        say(f"Columns left out: {listed(left_out, cap=20)}. {elsewhere}")
 
 
 def _table(columns: dict[str, list[str]], rows: list[Row], widest: int | None) -> Table:

@@ -22,7 +22,7 @@ class StepGuard:
         self.watched: list[str] = []
 
     def allows(self, losses: Tensor, parameters: Iterable[tuple[str, Tensor]]) -> bool:
-        """Tell whether the step may be taken."""
+        """Return whether the step may be taken."""
         gradients = _gradients(parameters)
         finite = self._count(losses, gradients)
         if finite.device.type == "cpu":

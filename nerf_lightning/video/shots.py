@@ -189,7 +189,7 @@ def depth_range(shots: list[Shot]) -> tuple[float, float]:
 
 
 def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which cameras normalized device coordinates can render: before the plane z = -1, and looking along -z."""
+    """Return which cameras normalized device coordinates can render: before the plane z = -1, and looking along -z."""
     zeros = torch.zeros(len(cameras.c2w))
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)

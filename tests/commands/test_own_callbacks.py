@@ -97,5 +97,5 @@ def test_flags_of_lightnings_need_no_plus(train, tmp_path):
 def test_a_fast_development_run_takes_one_step(train, tmp_path):
     result = train("trainer.lightning.fast_dev_run=true", "trainer.max_steps=2000")
     assert result.code == 0, result.err
-    assert "1 step of 64 rays" in result.err
+    assert "1 step, 64 rays per step" in result.err
     assert json.loads((tmp_path / "run" / "run.json").read_text())["finished_at_step"] == 1

@@ -270,8 +270,8 @@ def test_cameras_that_look_away_are_wrong_without_any_detail():
     scene = ball_scene(10, 12)
     flipped = torch.cat([scene.cameras.c2w[..., :3] * torch.tensor([1.0, -1, -1]), scene.cameras.c2w[..., 3:]], dim=-1)
     evidence, _ = examine(replace(scene, cameras=replace(scene.cameras, c2w=flipped)))
-    judged(evidence, "common middle", "wrong", "OpenCV's axes rather than OpenGL's")
-    judged(evidence, "box in view", "wrong")
+    judged(evidence, "camera directions", "wrong", "OpenCV's axes rather than OpenGL's")
+    judged(evidence, "scene box", "wrong")
 
 
 @pytest.mark.parametrize(("factor", "says"), [(0.1, "inside it"), (40.0, "a dot")])

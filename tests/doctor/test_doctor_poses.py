@@ -82,7 +82,12 @@ def test_a_sound_capture_has_nothing_wrong():
         (c2w().roll(1, 0), "order of photographs", "pose of the next one", "by one"),
         (c2w().roll(-1, 0), "order of photographs", "pose of the previous one", "by one"),
         (c2w().flip(0), "order of photographs", "reversed", "Reverse"),
-        (c2w()[torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3))], "poses and pixels", "%", "again"),
+        (
+            c2w()[torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3))],
+            "poses match photographs",
+            "%",
+            "again",
+        ),
         (moved(5), "single poses", "view 5.png contradicts", "Remove these views"),
         (swapped(2, 8), "single poses", "view 2.png fits the camera of view 8.png", "swap them back"),
     ],

@@ -12,7 +12,6 @@ from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.export.page import PageExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
@@ -78,17 +77,9 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(t
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("exporter", "settings", "said"),
-    [
-        (ImagesExport, {"max_views": 0}, "what.max_views=0"),
-        (PageExport, {"photographs": -1}, "what.photographs=-1: give 0 or more"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(exporter, settings, said):
-    with pytest.raises(InputError) as error:
-        exporter(**settings)
-    assert said in str(error.value)
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match=r"what\.max_views=0"):
+        ImagesExport(max_views=0)
 
 
 @pytest.mark.parametrize("kind", [RaggedLevel, MaskedLevel])

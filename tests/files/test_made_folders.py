@@ -29,7 +29,7 @@ ALLOWED = {
     "data/pixels/mapped_store.py": {"unlink"},  # of a header in a cache, before its pixels are replaced
     "checkpoints/writing.py": {"mkdir", "unlink"},  # no run folder that is gone; of a checkpoint in its own folder
     "runs/sweep.py": {"unlink"},  # of records of jobs, by their names
-    "viewer/recorded_path.py": {"unlink"},  # of a file that it has just made
+    "video/paths/recorded_path.py": {"unlink"},  # of a file that it has just made
 }
 
 

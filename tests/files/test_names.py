@@ -48,8 +48,8 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
     },
     "report": {"folder / f'{part}.png'"},
     "runs": {"make_folder(records_folder(sweep_folder)) / f'{self.number}.json'"},
+    "video": {"folder / f'{stem}_{number:03d}{ending}'"},
     "training": {"folder / f'epoch_{epoch:04d}.png'", "folder / f'step_{step:07d}.png'"},
-    "viewer": {"folder / f'{stem}_{number:03d}{ending}'"},
 }
 
 

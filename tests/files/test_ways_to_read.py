@@ -12,7 +12,7 @@ LOADERS = {"np", "torch", "OmegaConf", "json", "yaml", "pickle", "ElementTree"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
     "config/instantiate.py": ["load"],
-    "commands/train_job/live_view.py": ["print"],  # the address, which is ours
+    "extensions/viewer/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
     "cli/process.py": ["print", "print", "open"],
@@ -21,7 +21,7 @@ OURS = {
     "config/help/docstrings.py": ["read_text"],
     "config/help/search.py": ["read_text"],
     "config/help/yaml_comments.py": ["read_text"],
-    "export/page_file.py": ["read_text"],
+    "extensions/splats/page_file.py": ["read_text"],
     "messages/console.py": ["print"],
     "training/loggers.py": ["open"],
     "runs/sweep.py": ["print"],

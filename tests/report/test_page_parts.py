@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.curves import curve_drawings
+from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
 from nerf_lightning.report.embedding import LONGEST_SIDE, embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
 from nerf_lightning.report.page import Report, write_report
@@ -59,19 +59,19 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
         "Training loss/$\\evil": (steps, [1.0, 1.0, 1.0]),
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
-    drawings = {drawing.label: drawing.address for drawing in curve_drawings(curves)}
-    assert [drawing.note for drawing in curve_drawings(curves)] == ["", ""]
-    assert list(drawings) == ["PSNR (dB)", "loss"]
-    kind, _, content = drawings["loss"].partition(",")
-    assert kind == "data:image/svg+xml;base64"
-    assert base64.b64decode(content).startswith(b"<?xml")
+    (psnr,) = curve_drawings(curves)  # of the losses, one point each can be drawn
+    assert (psnr.label, psnr.note) == ("PSNR (dB)", "")
+    assert [curve["label"] for curve in psnr.curves] == ["training", "validation"]
+    assert psnr.curves[0]["values"] == [10.0, 20.0, 25.0]
+    two = curve_drawings({f"PSNR/train_{level}": (steps, [1.0, 2.0, 3.0]) for level in ("coarse", "fine")})
+    assert [curve["label"] for curve in two[0].curves] == ["training (coarse)", "training (fine)"]
     assert curve_drawings({}) == []
 
 
 def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
     curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
     (drawing,) = curve_drawings(curves)
-    assert len(drawing.address) < 200_000
+    assert len(drawing.curves) == MOST_CURVES
     assert drawing.note == "2988 more curves are in the run's TensorBoard files."
     write_report(Report("a run", curves=[drawing]), tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()

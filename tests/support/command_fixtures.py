@@ -14,7 +14,6 @@ from support.running import FAST, FAST_PATH, NO_LAYOUT, start_cold
 from support.scenes import ball_scene
 
 from nerf_lightning.cli import main as cli
-from nerf_lightning.export.splats import initialize
 
 
 @dataclass
@@ -24,14 +23,6 @@ class Result:
     code: int
     out: str
     err: str
-
-
-@pytest.fixture(autouse=True)
-def few_looks_around():
-    """Splats begin with fewer views of the field than a person's."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(initialize, "COUNT", 16)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 from support.shiny_ball import read_page
 
-from nerf_lightning.export.splats import gaussians
-from nerf_lightning.export.splats.gaussians import Pinhole
-from nerf_lightning.export.splats.reference import rasterize
+from nerf_lightning.extensions.splats import gaussians
+from nerf_lightning.extensions.splats.gaussians import Pinhole
+from nerf_lightning.extensions.splats.reference import rasterize
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 
 STATE = "return document.body.dataset.state"

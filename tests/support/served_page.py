@@ -13,11 +13,11 @@ from support.scenes import ball_scene, tiny_model
 from support.viser_client import ViserClient
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.viewer.guarded_server import Auth
-from nerf_lightning.viewer.page import Page
-from nerf_lightning.viewer.render_queue import RenderQueue
-from nerf_lightning.viewer.renderer import SlicedRenderer
-from nerf_lightning.viewer.shown_photographs import Photographs
+from nerf_lightning.extensions.viewer.guarded_server import Auth
+from nerf_lightning.extensions.viewer.page import Page
+from nerf_lightning.extensions.viewer.render_queue import RenderQueue
+from nerf_lightning.extensions.viewer.renderer import SlicedRenderer
+from nerf_lightning.extensions.viewer.shown_photographs import Photographs
 
 HEIGHT = 24
 

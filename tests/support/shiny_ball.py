@@ -11,9 +11,9 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.base import PageExtras
-from nerf_lightning.export.splats.gaussians import Gaussians
-from nerf_lightning.export.splats.quantized import QuantizedSplats
+from nerf_lightning.export.base import RunContext
+from nerf_lightning.extensions.splats.gaussians import Gaussians
+from nerf_lightning.extensions.splats.quantized import QuantizedSplats
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -46,8 +46,8 @@ def record_of(scene, **changes):
     return replace(scene_record(scene), **changes)
 
 
-def beside(scene, *facts) -> PageExtras:
-    return PageExtras(scene, facts=tuple(facts))
+def run_of(scene, *facts) -> RunContext:
+    return RunContext(scene, facts=tuple(facts))
 
 
 def read_page(page) -> tuple[dict, Gaussians]:

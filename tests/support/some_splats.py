@@ -2,7 +2,7 @@
 
 import torch
 
-from nerf_lightning.export.splats.gaussians import Gaussians, Pinhole
+from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
 
 
 def camera(width=33, height=21, focal=30.0):

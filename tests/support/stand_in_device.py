@@ -222,7 +222,7 @@ class _Operations(TorchDispatchMode):
 
 
 def lies_there(tensor: Tensor) -> bool:
-    """Tell whether a tensor lies on the device."""
+    """Return whether a tensor lies on the device."""
     return getattr(tensor.untyped_storage(), "lies_there", False)
 
 

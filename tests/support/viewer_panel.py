@@ -8,13 +8,13 @@ import numpy as np
 from support.scenes import ball_scene, tiny_model
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.extensions.viewer.camera_state import quaternion_of
+from nerf_lightning.extensions.viewer.client import ViewerClient
+from nerf_lightning.extensions.viewer.controls import Controls
+from nerf_lightning.extensions.viewer.render_queue import RenderQueue
+from nerf_lightning.extensions.viewer.renderer import SlicedRenderer
+from nerf_lightning.extensions.viewer.shown_photographs import Photographs
 from nerf_lightning.video.paths.base import frame_of
-from nerf_lightning.viewer.camera_state import quaternion_of
-from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.controls import Controls
-from nerf_lightning.viewer.render_queue import RenderQueue
-from nerf_lightning.viewer.renderer import SlicedRenderer
-from nerf_lightning.viewer.shown_photographs import Photographs
 
 HEIGHT = 12
 

@@ -131,15 +131,15 @@ def _announce_hours(job: TrainJob, seconds: float) -> None:
 def _announce(job: TrainJob, folder: HeldFolder) -> None:
     parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
     tile = job.system.train_step.tiles.points
-    how = "whole batches" if tile is None else f"tiles of {tile} points"
+    how = "whole batches" if tile is None else f"tiles of {tile:,} points"
     seconds = job.config.budget.seconds
+    log.info("run folder %s", folder.path)
     log.info(
-        "run folder %s: %s of %d rays, %s parameters, %s, %s",
-        folder.path,
+        "training: %s, %s rays per step, %s parameters, %s, %s",
         f"{job.num_steps:,} step{'s' * (job.num_steps != 1)}"
         if seconds is None
-        else f"{spoken(seconds)} (budget.seconds) of steps",
-        job.data.batches.batch_rays,
+        else f"{spoken(seconds)} (budget.seconds)",
+        f"{job.data.batches.batch_rays:,}",
         f"{parameters:,}",
         job.settings.describe(),
         "steps replayed" if job.settings.records(job.system.train_step) else how,

@@ -84,8 +84,8 @@ def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
     )
     cure = f"train longer ({resume_command(page.parent)} {length})."
     if not _still_learns(job, page.parent, psnr, steps):
-        cure = advice(job.checks or ()) or f"the {what} are fine; {cure}"
-    return f"result       {page}: {quality}{used} of {total} {what} used. To improve it: {cure}"
+        cure = advice(job.checks or ()) or cure
+    return f"result       {page}: {quality}{used} of {total} {what} used. To improve it, {cure[0].lower()}{cure[1:]}"
 
 
 def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> bool:

@@ -288,7 +288,7 @@ def _by_plain_name(
 
 
 def _of_one_kind(wanted: set[str], folders: set[str]) -> bool:
-    """Tell whether a file in these folders can be what a name with those means, and not of another split or kind."""
+    """Return whether a file in these folders can be what a name with those means, and not of another split or kind."""
     beside = {folder for folder in folders - wanted if BESIDE_PHOTOGRAPHS.fullmatch(folder)}
     splits = wanted & set(SPLIT_FOLDERS)
     return not beside and not (splits and folders & set(SPLIT_FOLDERS) - splits)

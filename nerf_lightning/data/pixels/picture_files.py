@@ -95,7 +95,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def is_heic(path: Path) -> bool:
-    """Tell whether a file begins as phones' HEIC photographs do, whatever its name."""
+    """Return whether a file begins as phones' HEIC photographs do, whatever its name."""
     try:
         with open_regular(path, None) as file:
             start = file.read(12)
@@ -140,7 +140,7 @@ def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Tell whether a picture that is not decoded yet has more than 8 bits per channel."""
+    """Return whether a picture that is not decoded yet has more than 8 bits per channel."""
     return ";16" in str(getattr(image, "tile", "")) or image.info.get("bit_depth", 8) > 8
 
 

@@ -49,7 +49,7 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
     if color is None:
         return pixels, None
     log.info(
-        "%s: the photographs show a thing before plain %s, which is made transparent (scene.cut_out=false keeps it)",
+        "%s: the object is on a plain %s background, which was made transparent (scene.cut_out=false keeps it)",
         for_terminal(name),
         in_words(color),
     )
@@ -125,7 +125,7 @@ def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
 
 
 def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Tell which pixels have the plain color and reach the edge through such pixels."""
+    """Return which pixels have the plain color and reach the edge through such pixels."""
     from scipy import ndimage
 
     parts, count = ndimage.label(plain)

@@ -114,7 +114,7 @@ class ColmapReader(CaptureReader):
         return of_one_lens(capture, lenses)
 
     def _own(self, folder: str) -> bool:
-        """Tell whether a folder is one of photographs, and not one that holds all kinds of pictures."""
+        """Return whether a folder is one of photographs, and not one that holds all kinds of pictures."""
         return Path(folder) not in (self.folder(), self.top()) and Path(folder).is_relative_to(self.top())
 
     def _model(self, root: Path) -> Path:

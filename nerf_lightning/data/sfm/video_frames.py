@@ -50,7 +50,7 @@ def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
 
 
 def is_blurred(frame: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Tell whether a frame has no details as fine as its pixels could show, in a small gray version.
+    """Return whether a frame has no details as fine as its pixels could show, in a small gray version.
 
     What is sharp loses most of its fine details in a blur of one pixel; what was blurred before has none to lose
     (after Crete et al., "The blur effect", 2007). A blank frame counts as blurred.

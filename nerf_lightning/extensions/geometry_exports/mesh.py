@@ -11,7 +11,15 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export.base import Export, Report, refuse_ndc, require_free, require_setting
+from nerf_lightning.export.base import (
+    MODEL_ALONE,
+    Export,
+    Report,
+    RunContext,
+    refuse_ndc,
+    require_free,
+    require_setting,
+)
 from nerf_lightning.extensions.geometry_exports import density_mesh, fused_mesh
 from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution
 from nerf_lightning.extensions.geometry_exports.density_mesh import (
@@ -124,7 +132,9 @@ class MeshExport(Export):
             self.faces = TEXTURED_FACES
         self.format = self.format or ("glb" if self.texture else "ply")
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
         beside = ("mtl", "png") if self.texture and self.format == "obj" else ()

@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.export.base import Export, require_free, require_setting
+from nerf_lightning.export.base import MODEL_ALONE, Export, RunContext, require_free, require_setting
 from nerf_lightning.export.visibility import nearest_views, num_agreeing, see
 from nerf_lightning.extensions.geometry_exports.mesh_files import require_library
 from nerf_lightning.files.atomic import whole_file
@@ -73,7 +73,9 @@ class PointsExport(Export):
         require_setting("min_opacity", self.min_opacity, 0 <= self.min_opacity < 1, shares)
         require_setting("tolerance", self.tolerance, self.tolerance > 0, "give a share of the distance, above 0.")
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the cloud."""
         require_free(files=[child_of(folder, f"points.{self.format}")])
         if self.format == "las":

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export.base import Export, Report, refuse_ndc, require_free
+from nerf_lightning.export.base import MODEL_ALONE, Export, Report, RunContext, refuse_ndc, require_free
 from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution, sample_density
 from nerf_lightning.extensions.geometry_exports.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
@@ -37,7 +37,9 @@ class VolumeExport(Export):
 
     resolution: int = 128
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the grids."""
         refuse_ndc(record, "volume")
         arrays, about = folder / "volume.npz", folder / "volume.json"

@@ -184,7 +184,7 @@ def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> 
 def seen_at(
     cameras: Cameras, view: int, points: Float[Tensor, "points 3"]
 ) -> tuple[Bool[Tensor, "points"], Int[Tensor, "points"], Int[Tensor, "points"]]:
-    """Tell which world points lie in the picture of one view, and in which of its pixels (x, y; elsewhere 0).
+    """Return which world points lie in the picture of one view, and in which of its pixels (x, y; elsewhere 0).
 
     Whether something hides them is not asked.
     """

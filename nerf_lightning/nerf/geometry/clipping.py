@@ -44,7 +44,7 @@ class CropBox:
         return distances_in_box(inside, torch.stack([torch.zeros_like(self.size), self.size]))
 
     def holds(self, points: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
-        """Tell which points lie inside."""
+        """Return which points lie inside."""
         place = self._in_box(points)
         return ((place > 0) & (place < self.size)).all(dim=-1)
 

@@ -37,7 +37,7 @@ class Contracted(nn.Module):
         self._known = None
 
     def is_on(self) -> bool:
-        """Tell whether space is contracted."""
+        """Return whether space is contracted."""
         if self._known is None:
             self._known = bool(self.switch)
         return self._known

@@ -9,7 +9,7 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 @disable_autocast
 def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
-    """Tell which poses are a rotation (orthonormal, determinant +1) and a finite center."""
+    """Return which poses are a rotation (orthonormal, determinant +1) and a finite center."""
     rotation = c2w[..., :3]
     identity = torch.eye(3, dtype=c2w.dtype, device=c2w.device)
     off = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))

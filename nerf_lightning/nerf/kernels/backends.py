@@ -238,7 +238,7 @@ def without(*modules: str) -> Iterator[None]:
 
 
 def is_on(module: str) -> bool:
-    """Tell whether a kernel has not been switched off."""
+    """Return whether a kernel has not been switched off."""
     return module not in _switched_off
 
 
@@ -260,7 +260,7 @@ def backend_for(kernel: str, device: torch.device) -> ModuleType | None:
 
 
 def can_compile(device: torch.device) -> bool:
-    """Tell whether torch.compile has what it needs: a C++ compiler on the CPU."""
+    """Return whether torch.compile has what it needs: a C++ compiler on the CPU."""
     return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
 
 

@@ -49,12 +49,12 @@ def pixels_in_tile(model: Model, tile_points: int, training: bool = False) -> in
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
-    """Tell whether there was no room for a tensor; smaller tiles may find it."""
+    """Return whether there was no room for a tensor; smaller tiles may find it."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def is_device_failure(error: BaseException) -> bool:
-    """Tell whether the GPU itself has failed: whatever lay on it is lost, and the process can no longer use it."""
+    """Return whether the GPU itself has failed: whatever lay on it is lost, and the process can no longer use it."""
     return isinstance(error, torch.AcceleratorError) or str(error).startswith(("CUDA error", "Triton Error [CUDA]"))
 
 

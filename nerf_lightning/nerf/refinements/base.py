@@ -21,7 +21,7 @@ class Refinement(Part, ABC):
         """Return the cameras as they have been learned so far."""
 
     def moves(self) -> bool:
-        """Tell whether there is anything to learn."""
+        """Return whether there is anything to learn."""
         return next(self.parameters(), None) is not None
 
 

@@ -154,7 +154,7 @@ class PixelStore:
         return self._picture(self.rgba, index)
 
     def kept(self, index: int) -> Bool[Tensor, "height width"] | None:
-        """Tell which pixels of one view the mask keeps; None where there is no mask."""
+        """Return which pixels of one view the mask keeps; None where there is no mask."""
         return None if self.mask is None else self._picture(self.mask, index) > 0
 
     def index_of(

@@ -116,7 +116,7 @@ def whole_batch(output: StepOutput) -> dict[str, torch.Tensor]:
 
 
 def is_constant(seen: dict[str, torch.Tensor], ratio: float) -> bool:
-    """Tell whether the light that the field itself sends is the same for all rays, unlike the photographs.
+    """Return whether the light that the field itself sends is the same for all rays, unlike the photographs.
 
     Rays of masked pixels do not count: nothing has told the field what lies there.
     """

@@ -45,7 +45,7 @@ class Monitor(Watcher):
         self.since += seconds
 
     def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
-        """Tell whether the step that begins gets a row, and so has to measure the norms of its gradients."""
+        """Return whether the step that begins gets a row, and so has to measure the norms of its gradients."""
         # XLA would compile the steps that get a row and those that do not as two programs.
         return system.device.type == "xla" or self.is_time(
             trainer.global_step + 1, int(trainer.estimated_stepping_batches)

@@ -36,7 +36,7 @@ class ValidationPictures(Watcher):
         self.view, self.bounds_time, self.not_before = view, every_steps == "auto", 0.0
 
     def is_time(self, step: int, last_step: int) -> bool:
-        """Tell whether to render after a step; always after the last one."""
+        """Return whether to render after a step; always after the last one."""
         waits = self.bounds_time and time.perf_counter() < self.not_before
         return step == last_step or (super().is_time(step, last_step) and not waits)
 

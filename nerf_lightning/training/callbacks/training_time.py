@@ -1,10 +1,18 @@
 """How long a training takes by itself: without what comes before its first step, and after its last."""
 
 import time
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A callback that measures time, in which pauses of the training are not to be counted."""
+
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds."""
 
 
 class TrainingTime(Callback):

@@ -36,7 +36,7 @@ class Watcher(Callback):
             self.watch(trainer, pl_module, outputs)
 
     def is_time(self, step: int, last_step: int) -> bool:
-        """Tell whether to look after a step."""
+        """Return whether to look after a step."""
         return step % self.every_steps == 0
 
     @abstractmethod

@@ -40,7 +40,7 @@ def preemptible() -> Iterator[None]:
 
 
 def wants_restart(code: Any) -> bool:
-    """Tell whether an exit code is that of a signal whose sender will start the run again."""
+    """Return whether an exit code is that of a signal whose sender will start the run again."""
     sent = {submitit_signal()} | ({signal.SIGUSR1} if hasattr(signal, "SIGUSR1") else set())
     return isinstance(code, int) and code - 128 in sent
 

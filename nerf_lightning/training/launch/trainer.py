@@ -102,7 +102,7 @@ class TrainerSettings(ComputeSettings):
         self.launched_by = launched_by  # read before the processes are (launch/processes.py)
 
     def records(self, train_step: TrainStep) -> bool:
-        """Tell whether to record a run's steps.
+        """Return whether to record a run's steps.
 
         auto: not compiled ones, or those of parts of one's own that do not say whether they can be replayed.
         """
@@ -112,7 +112,7 @@ class TrainerSettings(ComputeSettings):
         return tried and not not_replayed(train_step.objective, only_known=True)
 
     def records_there(self, train_step: TrainStep) -> bool:
-        """Tell whether to record a run's steps where its weights are: one's own Trainer may have moved them."""
+        """Return whether to record a run's steps where its weights are: one's own Trainer may have moved them."""
         return train_step.device.type == self.device_type and self.records(train_step)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:

@@ -90,7 +90,7 @@ class PathFrame:
 
 
 def is_point(given: object) -> bool:
-    """Tell whether something is three finite numbers.
+    """Return whether something is three finite numbers.
 
     >>> is_point([0, 1.5, -2]), is_point([0, 1]), is_point("top")
     (True, False, False)
@@ -99,7 +99,7 @@ def is_point(given: object) -> bool:
 
 
 def is_number(given: object) -> bool:
-    """Tell whether something is a number that a path can have: finite, and not astronomical."""
+    """Return whether something is a number that a path can have: finite, and not astronomical."""
     return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) < LARGEST
 
 

@@ -98,10 +98,10 @@ def test_a_ring_of_cameras_that_look_outward(tmp_path, radius, seed, kind):
     assert_filmed_as_photographed(scene)
     found = verdicts(scene)
     assert "wrong" not in found.values(), found
-    assert found["common middle"] == "look"
+    assert found["camera directions"] == "look"
 
 
 def test_cameras_around_a_heap_whose_axes_are_others_are_wrong(tmp_path):
     scene = heap().read("transforms", tmp_path / "capture")
     flipped = replace(scene, cameras=replace(scene.cameras, c2w=axes(scene.cameras.c2w, FLIP_YZ)))
-    assert verdicts(flipped)["common middle"] == "wrong"
+    assert verdicts(flipped)["camera directions"] == "wrong"

@@ -147,7 +147,7 @@ def test_a_capture_before_white_stands_in_a_box_on_white(tmp_path, caplog):
     root = capture(tmp_path / "capture")
     with caplog.at_level("INFO"):
         scene = read("transforms", root)
-    assert "before plain white, which is made transparent (scene.cut_out=false keeps it)" in caplog.text
+    assert "on a plain white background, which was made transparent (scene.cut_out=false keeps it)" in caplog.text
     assert (scene.space, scene.background, scene.protocol["cut_out"]) == ("bounded", "white_or_random", "white")
     assert read("transforms", root, background="random").background == "random"
     kept = read("transforms", root, cut_out=False)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import MODEL_ALONE, Export, RunContext
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -20,9 +20,11 @@ class MeanColorsExport(Export):
     def __init__(self, split: str = "test"):
         self.split = split
 
-    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(
+        self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
+    ) -> list[Path]:
         """Write the file; empty where the photographs cannot be read."""
-        scene, found = self.beside.photographs, {}
+        scene, found = run.photographs, {}
         for view in scene.splits[self.split] if scene is not None else ():
             rays = RayGenerator(scene.cameras, scene.near, scene.far)
             picture = render_picture(model, rays, view, scene.background, tile_points).rgb

@@ -12,14 +12,13 @@ import torch
 from filelock import FileLock
 from lightning.pytorch import Trainer
 
-from nerf_lightning.commands.train_job.live_view import Clocked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import run_folder as folders
 from nerf_lightning.runs.run_folder import RunFolder
 from nerf_lightning.training.callbacks import training_time
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
-from nerf_lightning.training.callbacks.training_time import TrainingTime
+from nerf_lightning.training.callbacks.training_time import Clocked, TrainingTime
 from nerf_lightning.training.launch.trainer import MOST_STEPS
 
 

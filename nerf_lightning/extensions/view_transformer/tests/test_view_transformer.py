@@ -9,8 +9,8 @@ from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.export.page import PageExport
 from nerf_lightning.extensions.many_scenes.joined import joined
+from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.extensions.view_transformer.nearest_view import NearestViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field, show_photographs

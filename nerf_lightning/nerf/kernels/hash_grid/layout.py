@@ -18,7 +18,7 @@ class HashGridLayout:
     """T, a power of two."""
 
     def is_hashed(self, level: int) -> bool:
-        """Tell whether a level has more vertices than its table has entries."""
+        """Return whether a level has more vertices than its table has entries."""
         return (self.resolutions[level] + 1) ** 3 > self.table_size
 
     def coarsest(self, levels: int) -> "HashGridLayout":

@@ -32,7 +32,7 @@ def march_torch(
 def occupied_intervals(
     rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells
 ) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
-    """Tell which intervals of each ray may hold something, and return the fenceposts of all.
+    """Return which intervals of each ray may hold something, and return the fenceposts of all.
 
     The shapes are the same whatever the grid holds.
     """
@@ -44,7 +44,7 @@ def occupied_intervals(
 
 
 def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
-    """Tell which positions lie in an occupied cell."""
+    """Return which positions lie in an occupied cell."""
     resolution = grid.cells.shape[0]
     center, half = center_and_half(grid.aabb)
     scaled = (positions - center) / half

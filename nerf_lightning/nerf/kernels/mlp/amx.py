@@ -29,7 +29,7 @@ X, W = 4, 6
 
 
 def is_allowed() -> bool:
-    """Tell whether this process may use the tiles; it asks for them."""
+    """Return whether this process may use the tiles; it asks for them."""
     try:
         return sys.platform == "linux" and bool(torch.cpu._init_amx())
     except (AttributeError, RuntimeError):  # an older torch, or a CPU that it does not know
@@ -45,7 +45,7 @@ def _say(builder: Any, text: str, *operands: Any) -> None:
 
 @intrinsic
 def is_tiled(context: Any, kind: Any) -> Any:
-    """Tell whether tiles multiply numbers of a kind."""
+    """Return whether tiles multiply numbers of a kind."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return ir.Constant(ir.IntType(1), kind == types.int64)

@@ -46,7 +46,7 @@ WIDE = bool(CPU.get("avx512f"))
 
 
 def takes(weights: Sequence[Tensor], dtype: torch.dtype, pads: bool = False) -> bool:
-    """Tell whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors.
+    """Return whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors.
 
     Args:
         weights: of all layers.

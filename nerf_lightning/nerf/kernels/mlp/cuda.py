@@ -41,7 +41,7 @@ INTERPRETED = triton.knobs.runtime.interpret
 
 @functools.cache
 def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
-    """Tell whether the kernels run here for a perceptron of these widths, from inputs to outputs: it is tried once."""
+    """Return whether the kernels run here for a perceptron of these widths, from inputs to outputs; tried once."""
     if len(sizes) - 1 not in LAYERS or max(sizes) > WIDEST:
         return False
     try:

@@ -194,7 +194,7 @@ def fill(inputs, row, hidden, flat, begin, directions, r):
 @njit
 @no_type_check
 def is_inside(points, s):
-    """Tell whether a sample lies in the unit cube, outside of which there is nothing."""
+    """Return whether a sample lies in the unit cube, outside of which there is nothing."""
     x, y, z = points[s, 0], points[s, 1], points[s, 2]
     return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
 

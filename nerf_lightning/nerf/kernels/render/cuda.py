@@ -245,7 +245,7 @@ def _join(
 @triton.jit
 @no_type_check
 def _inside(points, sample, valid):
-    """Tell whether points lie in the unit cube."""
+    """Return whether points lie in the unit cube."""
     x = tl.load(points + 3 * sample, mask=valid, other=0.0)
     y = tl.load(points + 3 * sample + 1, mask=valid, other=0.0)
     z = tl.load(points + 3 * sample + 2, mask=valid, other=0.0)

@@ -1,0 +1,17 @@
+"""What NerfBaselines reads by our entry point each time it starts: no torch is loaded here."""
+
+from nerfbaselines import register
+
+register(
+    {
+        "id": "nerf-lightning",
+        "method_class": "nerf_lightning.extensions.nerfbaselines.nerfbaselines:NerfLightning",
+        "backends_order": ["python"],
+        "metadata": {"name": "nerf_lightning", "licenses": [{"name": "Apache-2.0"}]},
+        "presets": {
+            "blender": {"@apply": [{"dataset": "blender"}], "model": "fast"},
+            "llff": {"@apply": [{"dataset": "llff"}], "model": "fast_proposal"},
+            "mipnerf360": {"@apply": [{"dataset": "mipnerf360"}], "model": "fast_proposal", "max_steps": 40_000},
+        },
+    }
+)

@@ -1,0 +1,143 @@
+"""Fit splats to a trained field and its photographs: what exports of splats share."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+
+from nerf_lightning.export.base import Export, Neutral, Report, RunContext, require_kernels, require_setting
+from nerf_lightning.extensions.splats.fit import Fitting, fit
+from nerf_lightning.extensions.splats.gaussians import Gaussians
+from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
+from nerf_lightning.extensions.splats.views import View, photographed, without_lens
+from nerf_lightning.nerf.geometry.panoramas import faces_of_panoramas
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
+from nerf_lightning.visualization.pictures import to_bytes
+
+ROOM = "nerf_lightning.extensions.splats"
+KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
+PER_SIDE, MOST = 200, 150_000
+MOST_SHOWN = 3_000_000  # 500 MB as PLY.
+STAGES = {"surfaces": 15.0, "comparing": 5.0}
+
+
+@dataclass(frozen=True)
+class FittedSplats:
+    """Splats, and what they were fitted to."""
+
+    gaussians: Gaussians
+    scene: SceneRecord
+    """The views that splats and field are compared on: a `Scene`, if there are photographs of them."""
+    pinholes: Cameras
+    """Their cameras without lenses."""
+    truth: Literal["photographs", "the field"]
+    """What they were fitted to."""
+
+    @property
+    def focal(self) -> float:
+        """The mean focal length of the pictures that they were fitted to (pixels)."""
+        return float(self.pinholes.focal.mean())
+
+
+@dataclass
+class SplatFitting(Export):
+    """An export that fits splats: its settings, and the fitting."""
+
+    needs_photographs = True
+    kernels = KERNELS
+
+    num_splats: int | Literal["auto"] = "auto"
+    seconds: float = 60.0
+    sh_degree: int = 2
+    longest: int = 800
+    max_views: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        shown = self.num_splats == "auto" or 1 <= self.num_splats <= MOST_SHOWN
+        rule = f"give 1 to {MOST_SHOWN:,} splats, which is what viewers show, or auto."
+        require_setting("num_splats", self.num_splats, shown, rule)
+        require_setting("seconds", self.seconds, self.seconds >= 0, "give seconds of fitting, 0 or more.")
+        require_setting("sh_degree", self.sh_degree, 0 <= self.sh_degree <= 3, "give 0, 1, 2 or 3.")
+        require_setting("longest", self.longest, self.longest >= 16, "give 16 pixels or more.")
+        require_setting("max_views", self.max_views, self.max_views >= 0, "give 0 or more.")
+
+    def stages(self) -> dict[str, float]:
+        """Return what takes how long, in seconds or so."""
+        return STAGES | {"fitting": self.seconds}
+
+    def fitted(
+        self, model: Model, record: SceneRecord, run: RunContext, tile_points: int, report: Report
+    ) -> FittedSplats:
+        """Return splats that begin on the field's surfaces, fitted to the photographs.
+
+        Without photographs they are fitted to renders of the field; so they are if the model has a correction for each
+        photograph that cannot be taken back.
+        """
+        for module in self.kernels:
+            require_kernels(module, "Fitting splats")
+        photographs = _photographs(record, run)
+        if record.cameras.lens_model == "equirectangular":
+            record, photographs = as_faces(record), None
+        scene = record if photographs is None else photographs
+        pinholes = without_lens(scene.cameras, self.longest)
+        budget = self._budget(pinholes)
+        around = look_around(model, record, tile_points, self.seed, report)
+        first = max(1, budget // 2) if self.seconds else budget
+        gaussians = initial_gaussians(around, first, self.sh_degree, self.seed)
+        if self.seconds:
+            views = [] if photographs is None else training_views(record, photographs, pinholes, run.neutral)
+            fitting = Fitting(budget, self.seconds, record.background, extent(pinholes), self.seed)
+            with torch.enable_grad():
+                gaussians = fit(gaussians, views, around.views(), fitting, report)
+        return FittedSplats(gaussians, scene, pinholes, "the field" if photographs is None else "photographs")
+
+    def _budget(self, pinholes: Cameras) -> int:
+        pixels = int((pinholes.width * pinholes.height).double().mean())
+        return min(PER_SIDE * math.isqrt(pixels), MOST) if self.num_splats == "auto" else self.num_splats
+
+
+def _photographs(record: SceneRecord, run: RunContext) -> Scene | None:
+    name = record.view_names[record.splits["train"][0]]
+    unknown = run.neutral is not None and run.neutral(torch.zeros(1, 1, 3), name) is None
+    return None if unknown else run.photographs
+
+
+def as_faces(record: SceneRecord) -> SceneRecord:
+    """Return a record of panoramas with the six faces of a cube for each: splats are fitted to pinhole pictures."""
+    views = torch.arange(len(record.view_names)).repeat_interleave(6)
+    return replace(
+        record,
+        cameras=faces_of_panoramas(record.cameras),
+        near=record.near[views],
+        far=record.far[views],
+        view_names=tuple(f"{record.view_names[view]}, face {face % 6}" for face, view in enumerate(views.tolist())),
+        splits={name: tuple(6 * k + i for k in split for i in range(6)) for name, split in record.splits.items()},
+    )
+
+
+def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral: Neutral | None = None) -> list[View]:
+    """Return the photographs that the model learned from, by its record, and of which anything counts.
+
+    `neutral` takes back what its correction learned of each.
+    """
+    trained = {record.view_names[view] for view in record.splits["train"]}
+    known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
+    views = []
+    for number in known:
+        view = photographed(scene, number, pinholes)
+        if neutral is not None:
+            rgb = neutral(view.rgba[..., :3] / 255.0, scene.view_names[number])
+            assert rgb is not None  # or nothing would be fitted to photographs
+            view = replace(view, rgba=torch.cat([to_bytes(rgb), view.rgba[..., 3:]], dim=-1))
+        if view.kept is None or bool(view.kept.any()):
+            views.append(view)
+    return views
+
+
+def extent(cameras: Cameras) -> float:
+    """Return how far the cameras are from their middle, at most (scene units)."""
+    eyes = cameras.c2w[:, :, 3]
+    return max(float((eyes - eyes.mean(dim=0)).norm(dim=-1).max()), 1e-6)

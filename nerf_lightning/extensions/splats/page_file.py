@@ -1,0 +1,198 @@
+"""A page as a file: what stands in it."""
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from markupsafe import Markup
+from PIL import Image
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.export.base import RunContext
+from nerf_lightning.extensions.splats.fitted import as_faces
+from nerf_lightning.extensions.splats.gaussians import DILATION, Gaussians, Pinhole
+from nerf_lightning.extensions.splats.page_marks import Marks
+from nerf_lightning.extensions.splats.quantized import QuantizedSplats
+from nerf_lightning.extensions.splats.rasterizer import rasterize
+from nerf_lightning.extensions.splats.views import color_behind, without_lens
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.html import data_address, json_in_page, own_policy, rendered
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.world_frame import gaps_around
+from nerf_lightning.nerf.rendering.background import at_evaluation, photograph
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
+from nerf_lightning.visualization.pictures import to_bytes
+
+FOLDER = Path(__file__).parent / "page_files"
+SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
+SHADERS = ("splats.vert", "splats.frag")
+NEAR_NDC = 0.2  # Of the distance at which content begins.
+INSIDE = 0.01  # So large a share of the splats lies beyond either side of the box that one turns around.
+BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
+STILL, PHOTOGRAPH = 640, 320  # Pixels of the longer side: of the still picture, of photographs.
+JPEG_QUALITY = 80
+PART_OF_PANORAMA = 1.5  # How much is seen around a panorama's direction, in radians.
+# Cameras that leave a wider gap do not stand all around: the page then turns to and fro, so far to either side at most.
+WIDEST_GAP, MOST_SWAY = 120.0, 20.0  # Degrees.
+
+
+@dataclass(frozen=True)
+class ViewOnPage:
+    """A place to jump to."""
+
+    name: str
+    source: str
+    """The photograph, as an address; empty where there is none."""
+
+
+def write_page(
+    target: Path,
+    splats: QuantizedSplats,
+    focal: float,
+    record: SceneRecord,
+    run: RunContext,
+    max_photographs: int,
+    facts: list[tuple[str, str]],
+    marks: Marks,
+    title: str | None = None,
+    first_view: str | None = None,
+) -> None:
+    """Write the page of splats, with what is known of them, and one to `max_photographs` places to jump to.
+
+    `focal` is that of the pictures that they were fitted to, in pixels. The view of `marks`, or the photograph, that is
+    called `first_view` is shown first; None: the training view nearest to their average.
+    """
+    packed, shown = splats.packed(), splats.gaussians()
+    views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
+    names = [view["name"] for view in marks["views"]]
+    if first_view in record.view_names and first_view not in names:
+        views = sorted({*views[1:], record.view_names.index(first_view)})
+        first = record.view_names.index(first_view)
+    else:
+        first = average_view(record, views)
+    middle, radius = _middle(shown, record)
+    up = functional.normalize(record.cameras.c2w[:, :, 1].mean(dim=0), dim=0)
+    about = splats.described() | {
+        "bytes": len(packed),
+        "focal": focal,
+        "dilation": DILATION,
+        "near": _nearest(record),
+        "unbounded": record.space == "contracted",
+        "cameras": [_camera(record.cameras, view) for view in views],
+        "first": views.index(first),
+        "first_view": names.index(first_view) if first_view in names else None,
+        "marks": marks,
+        "metres": record.metres_per_unit,
+        "sway": sway(record, middle, up),
+        "middle": middle,
+        "radius": radius,
+        "up": up.tolist(),
+        "path": list(run.keyframes),
+        "to_user": record.to_user.tolist(),
+        # A film has the shape of the first photograph.
+        "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
+    }
+    page = {
+        "title": title or run.name or record.name,
+        "facts": [("scene", record.name), *run.facts, *facts],
+        "views": [_view(record, run, view if max_photographs else None) for view in views],
+        "still": _jpeg(_still(shown, record, first), STILL),
+        "background": BEHIND[at_evaluation(record.background)],
+    }
+    style, vertices, pixels, *scripts = (
+        (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", *SHADERS, *SCRIPTS)
+    )
+    script = "\n".join(scripts)
+    text = rendered(
+        FOLDER / "page.html",
+        page=page,
+        policy=own_policy(script, style),
+        about=json_in_page(about),
+        script=Markup(script),
+        style=Markup(style),
+        vertices=Markup(vertices),
+        pixels=Markup(pixels),
+        splats=Markup(base64.b64encode(packed).decode()),
+    )
+    with whole_file(target) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def average_view(record: SceneRecord, views: Sequence[int]) -> int:
+    """Return that of the views, a training view if any is, whose camera is nearest to the training cameras' mean.
+
+    The model knows most about what lies there, and it is held as most photographs are.
+    """
+    train = set(record.splits["train"])
+    candidates = [view for view in views if view in train] or list(views)
+    known = record.cameras.c2w[sorted(train)]
+    spread = known[:, :, 3].std(dim=0, correction=0).norm().clamp(min=1e-6)
+    apart = record.cameras.c2w[candidates] - known.mean(dim=0)
+    apart[:, :, 3] /= spread
+    return candidates[int(apart.flatten(1).norm(dim=1).argmin())]
+
+
+def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -> float | None:
+    """Return how far the page turns to either side, in radians; None: all around, as the training cameras stand."""
+    away = record.cameras.c2w[list(record.splits["train"]), :, 3] - torch.tensor(middle)
+    first = functional.normalize(away[0] - (away[0] @ up) * up, dim=0)
+    azimuth = torch.rad2deg(torch.atan2(away @ torch.linalg.cross(up, first), away @ first))
+    gap = float(gaps_around(azimuth)[1].max())
+    return None if gap < WIDEST_GAP else math.radians(min(MOST_SWAY, (360.0 - gap) / 4))
+
+
+def _middle(splats: Gaussians, record: SceneRecord) -> tuple[list[float], float]:
+    """Return what one turns around, and how far things are from it, in the world."""
+    if record.space == "ndc":
+        return [0.0, 0.0, -2.0], 1.0
+    lower, upper = record.aabb
+    if record.space == "bounded":
+        lower, upper = (torch.from_numpy(np.quantile(splats.means.numpy(), at, axis=0)) for at in (INSIDE, 1 - INSIDE))
+    return ((lower + upper) / 2).tolist(), float((upper - lower).norm() / 2)
+
+
+def _nearest(record: SceneRecord) -> float:
+    """Return how near, along the axis of a camera, splats are drawn."""
+    return NEAR_NDC if record.space == "ndc" else float(record.near.min())
+
+
+def _still(splats: Gaussians, record: SceneRecord, view: int) -> Float[Tensor, "height width 3"]:
+    if record.cameras.lens_model == "equirectangular":
+        record, view = as_faces(record), 6 * view
+    camera = Pinhole.of(without_lens(record.cameras, STILL), view, float(record.near[view]))
+    return rasterize(splats, camera, color_behind(record.background)).clamp(0, 1)
+
+
+def _camera(cameras: Cameras, view: int) -> dict[str, Any]:
+    right, up, back, eye = cameras.c2w[view].T.tolist()
+    width, height = int(cameras.width[view]), int(cameras.height[view])
+    focal, center = cameras.focal[view].tolist(), cameras.center[view].tolist()
+    if cameras.lens_model == "equirectangular":
+        focal, center = [height / PART_OF_PANORAMA] * 2, [width / 2, height / 2]
+    return {"eye": eye, "axes": [right, up, back], "focal": focal, "center": center, "width": width, "height": height}
+
+
+def _view(record: SceneRecord, run: RunContext, view: int | None) -> ViewOnPage:
+    if view is None:
+        return ViewOnPage("start", "")
+    name, scene = record.view_names[view], run.photographs
+    # A panorama would not lie over what is seen from its place.
+    if scene is None or name not in scene.view_names or record.cameras.lens_model == "equirectangular":
+        return ViewOnPage(name, "")
+    return ViewOnPage(name, _jpeg(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))
+
+
+def _jpeg(picture: Float[Tensor, "height width 3"], longest: int) -> str:
+    image = Image.fromarray(to_bytes(torch.as_tensor(picture)).contiguous().numpy())
+    image.thumbnail((longest, longest))
+    content = io.BytesIO()
+    image.save(content, format="JPEG", quality=JPEG_QUALITY)
+    return data_address("image/jpeg", content.getvalue())

@@ -1,0 +1,185 @@
+"""`nerf train final.page=true`: exports at the end of a run, and in its report; without them, the run stays."""
+
+import json
+import os
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import create_autospec
+
+import pytest
+from support.measured_runs import leave_measured_run
+from support.running import FAST, refused, said
+from support.shiny_ball import all_around, record_of
+
+from nerf_lightning.commands.export import page_path
+from nerf_lightning.commands.train_job import show
+from nerf_lightning.commands.train_job.build import TrainJob
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.extensions.splats.page import PageExport
+from nerf_lightning.files.html import SCENE_PAGE
+from nerf_lightning.report.page import Report
+from nerf_lightning.report.read_run import _add_exports
+from nerf_lightning.video.paths.auto import AutoPath
+from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.photograph_path import PhotographPath
+
+LEAST = (*FAST, "logger=none", "final.video=false", "final.evaluate=false", "evaluation.num_pictures=0")
+
+
+@pytest.fixture
+def train(nerf, capture, tmp_path, monkeypatch):
+    """Train with a page whose export is another."""
+
+    def call(export, *arguments):
+        with monkeypatch.context() as patched:
+            patched.setattr(PageExport, "export", export)
+            given = ("scene=npz", f"scene.path={capture}", *LEAST, f"paths.output_dir={tmp_path / 'run'}", *arguments)
+            return nerf("train", *given)
+
+    return call
+
+
+def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
+    seen = {}
+
+    def export(self, model, record, folder, tile_points, run):
+        seen.update(run=run, degree=self.sh_degree, training=model.training)
+        (folder / "page.html").write_bytes(SCENE_PAGE)
+        return [folder / "page.html"]
+
+    result = train(export, "final.page.sh_degree=1", "final.cameras=true", "final.report=true")
+    assert result.code == 0, result.err
+    exported = tmp_path / "run" / "export"
+    assert f"page         {exported}/page.html" in result.out
+    assert f"cameras      {exported}/transforms.json" in result.out
+    report = (exported.parent / "report.html").read_text()
+    assert 'href="./export/page.html">Open the 3D scene' in report
+    assert 'href="./export/transforms.json">transforms.json (0.' in report
+    *_, last, view = result.out.splitlines()
+    assert re.fullmatch(rf"look at it   \S*nerf view ckpt={exported.parent}", view)
+    found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it, .+\."
+    assert re.fullmatch(found, last), last
+    assert (seen["degree"], seen["training"]) == (1, False)
+    assert len(seen["run"].photographs.view_names) == 10
+    assert seen["run"].keyframes[-1]["time"] == pytest.approx(10.0)
+
+
+FLAT, RISING = [20.0] * 40 + [25.0] * 60, [15.0 + 0.1 * row for row in range(100)]
+MEMORIZED = [5.0 + value for value in RISING]  # the training views alone
+
+
+@pytest.mark.parametrize(
+    ("steps", "curve", "cure"),
+    [
+        (43, FLAT, "train longer (nerf train resume=run budget.seconds=300)."),
+        (4000, RISING, "train longer (nerf train resume=run budget.seconds=300)."),
+        (4000, FLAT, "take 6 more photographs."),
+        (4000, MEMORIZED, "take 6 more photographs."),
+    ],
+)
+def test_longer_training_is_advised_before_more_photographs_while_it_helps(monkeypatch, steps, curve, cure):
+    monkeypatch.setattr(show, "read_curves", lambda folder: {"PSNR/train_fine": (range(100), curve)})
+    monkeypatch.setattr(show, "resume_command", lambda folder: f"nerf train resume={folder}")
+    job = create_autospec(
+        TrainJob,
+        instance=True,
+        scene=SimpleNamespace(view_names=["a"] * 16, left_out=["b"], truth=None),
+        config=SimpleNamespace(budget=SimpleNamespace(seconds=30)),
+        checks=[Check("coverage", "look", "a gap", "Take 6 more photographs.")],
+        system=SimpleNamespace(model=SimpleNamespace(level_names=("proposal", "fine"))),
+    )
+    line = show._result(job, Path("run/report.html"), 20.6, steps)
+    assert line.endswith(f": 20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it, {cure}")
+
+
+@pytest.mark.parametrize(("age", "of"), [(-60, "of an earlier checkpoint"), (60, "")])
+def test_what_was_exported_before_the_last_checkpoint_is_not_taken_for_its(tmp_path, age, of):
+    for name, content in {
+        "checkpoints/last.ckpt": b"",
+        "export/page.html": SCENE_PAGE,
+        "export/points.ply": b"",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    for file in (tmp_path / "export").iterdir():
+        os.utime(file, ns=(0, (tmp_path / "checkpoints/last.ckpt").stat().st_mtime_ns + age * 10**9))
+    report = Report("a run")
+    _add_exports(report, tmp_path / "export", tmp_path)
+    assert (report.scene_page, report.scene_page_age) == ("./export/page.html", of)
+    assert report.exports == [(f"points.ply (0 MB{of and ', '}{of})", "./export/points.ply")]
+
+
+def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
+    def export(*_):
+        raise OSError(28, "No space left on device")
+
+    result = train(export, "final.page=true")
+    assert result.code == 0, result.err
+    run = tmp_path / "run"
+    assert "The run is complete, but final.page failed: OSError: [Errno 28] No space" in result.err
+    assert f"nerf export ckpt={run} what=page writes it" in result.err
+    assert not (run / "export").exists()
+    assert "Traceback" not in result.err
+    assert json.loads((run / "run.json").read_text())["finished_at_step"] == 4
+
+
+@pytest.mark.parametrize(
+    ("argument", "parts"),
+    [
+        ("final.page=huge", ("final.page=huge: give true, or settings", "final.page.KEY=VALUE")),
+        ("final.page.seconds=-1.0", ("final.page: what.seconds=-1.0", "0 or more")),
+        ("final.page.size=3", ("final.page: nerf export has no setting what.size",)),
+        ("final.pages=true", ("nerf train has no setting final.pages",)),
+    ],
+)
+def test_what_cannot_be_exported_is_said_before_the_training(train, tmp_path, argument, parts):
+    said(train(PageExport.export, argument), *parts)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_report_links_the_page_from_wherever_it_lies(nerf, tmp_path):
+    run = leave_measured_run(tmp_path / 'a "run" <b>')
+    target = tmp_path / "elsewhere" / "report.html"
+    given = (run, "doctor=false", f"paths.output_dir={target.parent}")
+    (run / "export").mkdir()
+    (run / "export" / "page.html").write_text("<html>somebody's own</html>")
+    assert nerf("report", *given).code == 0
+    assert "page.html" not in target.read_text()
+    (run / "export" / "page.html").write_bytes(SCENE_PAGE)
+    assert nerf("report", *given).code == 0
+    assert 'href="./../a%20%22run%22%20%3Cb%3E/export/page.html"' in target.read_text()
+
+
+def record(folder, name, age, x):
+    folder.mkdir(exist_ok=True)
+    places = (Keyframe((x + i, 0.0, 1.0), look_at=(0.0, 0.0, 0.0), time=float(i)) for i in range(2))
+    write_keyframes(folder / name, list(places))
+    os.utime(folder / name, (1e9 - age, 1e9 - age))
+
+
+def test_what_was_recorded_last_is_played_unless_another_path_is_asked_for(tmp_path):
+    scene = record_of(all_around())
+    assert len(page_path(AutoPath(), scene, tmp_path)) == 25  # a circle
+    record(tmp_path / "viewer", "camera_path_001.yaml", 20, 3.0)
+    record(tmp_path / "viewer", "camera_path_002.yaml", 10, 5.0)
+    assert [each["position"][0] for each in page_path(AutoPath(), scene, tmp_path)] == [5.0, 6.0]
+    assert len(page_path(Orbit(), scene, tmp_path)) == 25
+
+
+def test_what_cannot_be_played_is_said_and_a_path_is_made(tmp_path, caplog):
+    scene = record_of(all_around())
+    record(tmp_path / "viewer", "camera_path_001.yaml", 10, 5.0)
+    (tmp_path / "viewer" / "camera_path_001.yaml").write_text("keyframes: 3")
+    assert len(page_path(AutoPath(), scene, tmp_path)) == 25
+    assert "does not play the path that was recorded last" in caplog.text
+    refused(page_path, PhotographPath(views=["absent"]), scene, tmp_path, parts=("absent",))
+
+
+def test_nothing_is_taken_through_a_link(tmp_path):
+    record(tmp_path / "elsewhere", "camera_path_001.yaml", 10, 5.0)
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "viewer").symlink_to(tmp_path / "elsewhere")
+    assert len(page_path(AutoPath(), record_of(all_around()), run)) == 25

@@ -1,0 +1,96 @@
+"""A view as a picture: one of its channels, or truth and render side by side; and the depth that hides lines."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn.functional import pad
+
+from nerf_lightning.extensions.viewer.renderer import View
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
+from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
+
+COLOR = "color"
+PAPER, LINE = 237, 255
+# Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
+MOST_DEPTH_SIDE = 320
+FARTHEST = 167.0  # viser sends depths as whole numbers of 1e-5 in three bytes: what is farther cannot be told.
+
+
+def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
+    """Return a channel of a view as a picture.
+
+    Depth is bright where it is near, over the range of what this view shows; normals are in the model's axes, each from
+    -1 to 1 as red, green and blue. What light passes through fades to pale gray.
+    """
+    return to_bytes(CHANNELS[channel](view))
+
+
+def _depth(view: View) -> Float[Tensor, "height width 3"]:
+    near, far = visible_range(view.depth, view.opacity)
+    return faded(color_map(view.depth, low=far, high=near), view.opacity)
+
+
+def _normals(view: View) -> Float[Tensor, "height width 3"]:
+    rays = _rays(view, all_pixels(view.camera, 0))
+    normals = normals_from_depth(rays.origins + view.depth[..., None] * rays.directions)
+    return faded(0.5 + 0.5 * normals, view.opacity)
+
+
+def _rays(view: View, pixels: PixelIndex) -> RayBundle:
+    nothing = torch.zeros(1)
+    return rays_through_pixels(replace(view.camera, ndc=None), pixels, nothing, nothing)
+
+
+CHANNELS: dict[str, Callable[[View], Tensor]] = {
+    COLOR: lambda view: view.rgb,
+    "depth": _depth,
+    "opacity": lambda view: view.opacity[..., None].expand(-1, -1, 3),
+    "normals": _normals,
+}
+
+
+def wiped(
+    truth: UInt8[Tensor, "height width 3"], render: UInt8[Tensor, "height width 3"], share: float
+) -> UInt8[Tensor, "height width 3"]:
+    """Return the truth in the left `share` of the picture and the render in the rest, with a line between.
+
+    >>> wiped(torch.zeros(1, 4, 3).byte(), torch.full((1, 4, 3), 9).byte(), 0.5)[0, :, 0].tolist()
+    [0, 255, 9, 9]
+    """
+    cut = round(share * truth.shape[1])
+    joined = torch.cat([truth[:, :cut], render[:, cut:]], dim=1)
+    if 0 < cut < truth.shape[1]:
+        joined[:, cut - 1] = LINE
+    return joined
+
+
+def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the picture in the middle of paper whose width over height is `aspect`.
+
+    >>> in_window(torch.zeros(2, 2, 3).byte(), 2.0).shape
+    torch.Size([2, 4, 3])
+    """
+    height, width, _ = picture.shape
+    beside = max(0, round(height * aspect) - width)
+    above = max(0, round(width / aspect) - height)
+    edges = (0, 0, beside // 2, beside - beside // 2, above // 2, above - above // 2)
+    return pad(picture, edges, value=PAPER)
+
+
+def planar_depth(view: View) -> Float[np.ndarray, "height width"]:
+    """Return how far along the camera's axis each pixel's content lies (scene units), at most 320 pixels a side.
+
+    What light passes through, for more than half, hides nothing: it lies at `FARTHEST`.
+    """
+    step = max(1, -(-max(view.depth.shape) // MOST_DEPTH_SIDE))
+    inner = slice(step // 2, None, step)
+    rays = _rays(view, all_pixels(view.camera, 0).map(lambda each: each[inner, inner]))
+    depth = view.depth[inner, inner] * (rays.directions @ -view.camera.c2w[0, :, 2])
+    hidden = torch.where(view.opacity[inner, inner] > 0.5, depth, FARTHEST)
+    return hidden.clamp(0.0, FARTHEST).cpu().numpy()

@@ -1,0 +1,125 @@
+"""The panel of the page: what is shown, photographs, the camera path, the crop box, snapshots, exports."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.extensions.viewer.channels import CHANNELS
+from nerf_lightning.extensions.viewer.client import ViewerClient
+from nerf_lightning.extensions.viewer.export_panel import ExportPanel
+from nerf_lightning.extensions.viewer.frusta import Frusta
+from nerf_lightning.extensions.viewer.path_panel import PathPanel
+from nerf_lightning.extensions.viewer.photograph_panel import PhotographPanel
+from nerf_lightning.extensions.viewer.training_switch import TrainingPanel, TrainingSwitch
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.geometry.world_frame import points_to_user
+from nerf_lightning.nerf.types.scene import SceneRecord
+from nerf_lightning.video.paths.recorded_path import RecordedPath, new_file, told
+from nerf_lightning.visualization.pictures import save_png
+
+LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
+LEAST_SHARE = 0.01  # The crop box keeps this share of the scene's box along each axis.
+NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
+
+
+class Controls:
+    """The panel of one person, who first sees a vertical field of `fov` (radians).
+
+    What they save lies in `folder`; the files of the folder `exports` can be downloaded.
+    """
+
+    def __init__(
+        self,
+        session: ViewerClient,
+        folder: Path,
+        fov: float,
+        training: TrainingSwitch | None = None,
+        exports: Path | None = None,
+    ):
+        self.session, self.folder = session, folder
+        self.gui = session.client.gui
+        self.harmless = session.queue.errors.harmless
+        self.frusta = Frusta(session, lambda view: self.photographs.enter(view))
+        self.path = RecordedPath(session.around, folder)
+        self._wants_snapshot = False
+        session.on_finest = self._keep_snapshot
+        self.status = self.gui.add_markdown("")
+        session.on_picture = self._say_size
+        if training is not None:
+            TrainingPanel(session, training)
+        self._add_view(min(max(float(round(math.degrees(fov))), LEAST_DEGREES), MOST_DEGREES))
+        self.photographs = PhotographPanel(session, self.frusta)
+        PathPanel(session, self.path, self.frusta)
+        self._add_crop()
+        if exports is not None:
+            ExportPanel(session, exports)
+
+    def _add_view(self, degrees: float) -> None:
+        channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
+        fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, degrees)
+        snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
+
+        @channel.on_update
+        @self.harmless
+        def _(_: Any) -> None:
+            self.session.channel = channel.value
+            self.session.present()
+
+        @fov.on_update
+        @self.harmless
+        def _(_: Any) -> None:
+            self.session.client.camera.fov = math.radians(fov.value)
+
+        @snapshot.on_click
+        @self.harmless
+        def _(_: Any) -> None:
+            self._wants_snapshot = True
+            self.session.refinement.refresh()
+            self.session.queue.wake()
+
+    def _add_crop(self) -> None:
+        record = self.session.photographs.record
+        with self.gui.add_folder("Crop box", expand_by_default=False):
+            if record.space == "ndc":
+                self.gui.add_markdown(NO_CROP)
+                return
+            on = self.gui.add_checkbox("Show only what is in the box", False)
+            sliders = [
+                self.gui.add_multi_slider(axis, a, b, LEAST_SHARE * (b - a), (a, b), min_range=LEAST_SHARE * (b - a))
+                for axis, a, b in zip("xyz", *in_user_frame(record), strict=True)
+            ]
+
+        def update(_: Any) -> None:
+            lower, upper = zip(*(slider.value for slider in sliders), strict=True)
+            self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
+            self.frusta.draw_box(self.session.crop)
+            self.session.look()
+
+        for each in (on, *sliders):
+            each.on_update(self.harmless(update))
+
+    def _say_size(self, height: int, width: int, finest: bool) -> None:
+        said = f"{width} x {height} pixels{'' if finest else ', refining'}"
+        if said != self.status.content:
+            self.status.content = said
+
+    def _keep_snapshot(self) -> None:
+        picture = self.session.picture
+        if not self._wants_snapshot or picture is None:
+            return
+        self._wants_snapshot = False
+        try:
+            with new_file(self.folder, "snapshot", ".png") as path:
+                save_png(path, picture)
+        except OSError as error:  # nothing that is clicked ends a training
+            self.session.client.add_notification("Snapshot", told(error), color="red")
+        else:
+            self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+
+
+def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
+    """Return the lower and the upper corner of the box along the user's axes that holds the scene's (user's units)."""
+    places = points_to_user(torch.cartesian_prod(*record.aabb.unbind(dim=1)).double(), record.to_user.double())
+    return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

@@ -1,0 +1,35 @@
+"""The panel's part for what `nerf export` has written: each file can be downloaded."""
+
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.extensions.viewer.client import ViewerClient
+from nerf_lightning.files.regular import read_bytes
+from nerf_lightning.messages.escaping import for_terminal
+
+MOST_BYTES = 1 << 28  # A larger one would fill the memory of browser and viewer.
+MOST_LETTERS = 60
+
+
+def exported_files(folder: Path) -> list[Path]:
+    """Return the files that a run's exports have left in a folder, which need not be there; links may lead anywhere."""
+    found = (file for file in sorted(folder.glob("*")) if not file.name.startswith("."))
+    return [file for file in found if file.is_file() and not file.is_symlink()]
+
+
+class ExportPanel:
+    """Let one person download what is in the folder of exports when they come."""
+
+    def __init__(self, session: ViewerClient, folder: Path):
+        self.session, files = session, exported_files(folder)
+        if not files:
+            return
+        gui, harmless = session.client.gui, session.queue.errors.harmless
+        with gui.add_folder("Exports", expand_by_default=False):
+            for file in files:
+                label = f"{for_terminal(file.name, MOST_LETTERS)} ({file.stat().st_size / 1e6:.2g} MB)"
+                button = gui.add_button(label, hint="Download")
+                button.on_click(harmless(self._sender(file)))
+
+    def _sender(self, file: Path) -> Any:
+        return lambda _: self.session.client.send_file_download(file.name, read_bytes(file, MOST_BYTES))

@@ -1,0 +1,114 @@
+"""What is drawn over the picture: the cameras of the photographs, the crop box, and the camera path."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from nerf_lightning.extensions.viewer.camera_state import quaternion_of
+from nerf_lightning.extensions.viewer.client import ViewerClient
+from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.video.paths.recorded_path import RecordedPath
+
+ROOT, CAMERAS, BOX, PATH = "/overlay", "/overlay/cameras", "/overlay/crop", "/overlay/path"
+GREY, BLUE, ORANGE = (90, 90, 90), (40, 110, 220), (240, 120, 20)
+SCALE = 0.03  # Size of a frustum as a share of the photographs' distance.
+PIECES, MOST_PIECES = 24, 2000  # Pieces of the path's line for each of its legs, and in all.
+INSIDE = 3.0  # Who stands within this many sizes of a keyframe's camera has its lines all around: they are not drawn.
+
+
+class Frusta:
+    """Draw cameras, the crop box and the path into what one person sees; `on_click` takes a clicked camera's view."""
+
+    def __init__(self, session: ViewerClient, on_click: Callable[[int], None]):
+        self.session, self.scene = session, session.client.scene
+        self.size = SCALE * session.around.radius
+        self.root = self.scene.add_frame(ROOT, show_axes=False)
+        self.cameras = self.scene.add_frame(CAMERAS, show_axes=False, visible=False)
+        self.on_click, self.has_cameras = on_click, False
+        self.box: Any = None
+        self._path: list[Any] = []
+        self._keyframes: list[tuple[Any, Tensor]] = []
+        session.on_move = self._hide_around
+
+    def show(self, visible: bool) -> None:
+        """Show or hide the cameras of the photographs."""
+        if visible and not self.has_cameras:
+            self.has_cameras = True
+            for view in self.session.photographs.shown:
+                self._add_camera(view)
+        self.cameras.visible = visible
+        self.session.draw_over("cameras", visible)
+
+    def hide(self, hidden: bool) -> None:
+        """Hide everything while a photograph is compared with its render pixel by pixel, or a path is played."""
+        self.root.visible = not hidden
+
+    def draw_box(self, box: CropBox | None) -> None:
+        """Draw the crop box, or take it away."""
+        if self.box is not None:
+            self.box.remove()
+            self.box = None
+        if box is not None:
+            from viser.transforms import SO3
+
+            turned = SO3.from_matrix(box.axes.mT.double().numpy()).wxyz
+            middle = (box.corner + 0.5 * box.size @ box.axes).double().numpy()
+            size = tuple(box.size.tolist())
+            self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
+        self.session.draw_over("crop box", box is not None)
+
+    def draw_path(self, path: RecordedPath) -> None:
+        """Draw a path in place of the one before: its keyframes as cameras, and the line that the camera goes along."""
+        for handle in self._path:
+            handle.remove()
+        self._path, self._keyframes = [], []
+        for number, (c2w, fov) in enumerate(path.views()):
+            camera = self._frustum(f"{PATH}/{number}", c2w, fov, path.shape, ORANGE)
+            self._path.append(camera)
+            self._keyframes.append((camera, c2w[:, 3]))
+        if (curve := path.curve()) is not None:
+            pieces = min(PIECES * (len(path.keyframes) - 1), MOST_PIECES)
+            at = torch.linspace(0.0, path.times[-1], pieces + 1, dtype=curve.knots.dtype)
+            ends = np.array(list(pairwise(curve.poses(at)[:, :, 3].numpy())))
+            line = self.scene.add_line_segments(f"{PATH}/line", ends, ORANGE, thickness=3.0, thickness_units="screen")
+            self._path.append(line)
+        self._hide_around()
+        self.session.draw_over("path", bool(self._path))
+
+    def _hide_around(self) -> None:
+        """Hide the keyframes that the person stands in: whoever has just added one would look out of it."""
+        here = self.session.pose()[:, 3]
+        for camera, place in list(self._keyframes):
+            shown = float((place - here).norm()) > INSIDE * self.size
+            if camera.visible is not shown:
+                camera.visible = shown
+
+    def _add_camera(self, view: int) -> None:
+        photographs = self.session.photographs
+        cameras = photographs.record.cameras
+        shape = int(cameras.width[view]) / int(cameras.height[view])
+        fov, thumbnail = vertical_field_of_view(cameras, view), photographs.thumbnail(view)
+        image = None if thumbnail is None else thumbnail.numpy()
+        handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, shape, GREY, image)
+        handle.on_click(self.session.queue.errors.harmless(lambda _: self.on_click(view)))
+
+    def _frustum(
+        self,
+        name: str,
+        c2w: Float[Tensor, "3 4"],
+        fov: float,
+        aspect: float,
+        color: tuple[int, int, int],
+        image: UInt8[np.ndarray, "height width 3"] | None = None,
+    ) -> Any:
+        """Draw a camera as the pyramid that it sees; `fov` is vertical, `aspect` width over height."""
+        look = {"scale": self.size, "thickness": 0.02 * self.size, "color": color, "image": image}
+        shadows = {"cast_shadow": False, "receive_shadow": False}
+        place = {"wxyz": quaternion_of(c2w), "position": c2w[:, 3].double().numpy()}
+        return self.scene.add_camera_frustum(name, fov, aspect, **look, **shadows, **place)

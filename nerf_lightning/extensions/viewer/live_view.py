@@ -1,0 +1,169 @@
+"""The page of `nerf view` while training."""
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.compute import ranks
+from nerf_lightning.data.captures.joined import one_capture
+from nerf_lightning.extensions.viewer.guarded_server import Auth
+from nerf_lightning.extensions.viewer.page import Page, require_viser
+from nerf_lightning.extensions.viewer.ports import require_address, tunnel
+from nerf_lightning.extensions.viewer.render_queue import RenderQueue
+from nerf_lightning.extensions.viewer.renderer import SlicedRenderer
+from nerf_lightning.extensions.viewer.shown_photographs import Photographs
+from nerf_lightning.extensions.viewer.training_switch import TrainingSwitch
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.callbacks.training_time import Clocked
+
+# Steps take their time, so a picture may as well.
+MOVING_SECONDS = 0.5
+# How much unused time for pictures is saved up at most (seconds).
+MOST_CREDIT = 0.1
+
+
+log = logging.getLogger(__name__)
+
+
+class LiveView(Callback):
+    """Render between steps, in the training's own thread, for whoever has the page open.
+
+    Training does not wait for the page: pictures get a share of the time, and viser's thread sends them. Nothing that
+    training reads is changed.
+
+    Args:
+        host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
+        port: the port, or the first to try.
+        share: maximum share of the time spent on rendering.
+        refresh_seconds: seconds between two renders of the same view.
+        max_height: height of the finest image, in pixels.
+        hosts: names under which browsers reach the page, besides 127.0.0.1, localhost and [::1], such as gate.example.
+
+    Raises:
+        InputError: no viser, no place to listen, or a host that is none.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        share: float = 0.15,
+        refresh_seconds: float = 3.0,
+        max_height: int = 480,
+        hosts: Sequence[str] | None = None,
+    ):
+        require_viser()
+        require_address(host, port)
+        if not 0 < share < 1:
+            raise InputError(f"viewer.live_view.share={share}: give a share of the time between 0 and 1, such as 0.15.")
+        self.auth, self.port = Auth(host, hosts), port
+        self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
+        self.page: Page | None = None
+        self.credit, self.last, self.refreshed = 0.0, 0.0, 0.0
+        self.switch, self.said = TrainingSwitch(), ""
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        """Open the page, and say where it is."""
+        if not trainer.is_global_zero:
+            return
+        scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+        if scene.capture_of is not None:
+            scene = one_capture(scene, 0)  # rays that name no capture run through the first
+        renderer = SlicedRenderer(
+            pl_module.model,
+            scene_record(scene),
+            scene.background,
+            pl_module.train_step.tiles.picture_points,
+            self.share,
+            MOVING_SECONDS,
+        )
+        photographs = Photographs(renderer.scene, scene, scene.background)
+        folder = Path(trainer.default_root_dir) / "viewer"
+        # Other processes would wait for this one at their next step, and only for so long.
+        self.switch = TrainingSwitch(can_pause=ranks.world_size() == 1)
+        queue = RenderQueue(renderer)
+        self.page = Page(queue, photographs, folder, self.auth, self.port, self.max_height, self.switch)
+        self.last = self.refreshed = time.perf_counter()
+        # Its token is for this terminal: others may read train.log.
+        print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
+        if ranks.largest(float(self.switch.wants_stop)):
+            trainer.should_stop = True
+            self._say(f"training was stopped from the page at step {trainer.global_step}")
+        if self.page is None:
+            return
+        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.train_step.num_steps
+        if self.switch.wants_pause:
+            self._pause(trainer, pl_module, self.page)
+        now = time.perf_counter()
+        self.credit = min(MOST_CREDIT, self.credit + self.share * (now - self.last))
+        self.last = now
+        queue = self.page.queue
+        if self.credit <= 0 or queue.is_empty:
+            return
+        if now - self.refreshed > self.refresh_seconds:
+            self.refreshed = now
+            queue.refresh()
+            self.switch.show()
+        self._spend(pl_module, queue)
+
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+        """Close the page."""
+        self._close()
+
+    def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
+        """Close the page."""
+        self._close()
+
+    def _pause(self, trainer: Trainer, system: Any, page: Page) -> None:
+        """Render for those who look on, and take no step, until somebody lets the training go on."""
+        self._say(f"training is paused at step {trainer.global_step}, as requested from the page")
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        signals = [each for each in callbacks if isinstance(each, StopSignals)]
+        share, renderer = self.share, page.queue.renderer
+        system.eval()
+        self.switch.show()
+        try:
+            renderer.share = 1.0
+            seconds = self.switch.pause_while(
+                page.queue.work_or_wait,
+                lambda: not page.is_empty,
+                lambda: any(each.asked_to_stop() for each in signals),
+            )
+        finally:
+            renderer.share = share
+            system.train()
+        for callback in callbacks:
+            if isinstance(callback, Clocked):
+                callback.leave_out(seconds)
+        self.last = time.perf_counter()
+        self._say(f"training continues after a pause of {spoken(seconds)}")
+
+    def _say(self, text: str) -> None:
+        if self.page is not None and text != self.said:
+            log.info("%s", text)
+            self.said = text
+
+    def _spend(self, system: Any, queue: RenderQueue) -> None:
+        # A slice that took longer is paid back before the next one begins.
+        system.eval()
+        while self.credit > 0 and queue.work():
+            now = time.perf_counter()
+            self.credit -= now - self.last
+            self.last = now
+        system.train()
+
+    def _close(self) -> None:
+        if self.page is not None:
+            self.page.close()
+            self.page = None

@@ -1,0 +1,67 @@
+"""The panel's part for photographs: one is chosen by its name, looked through, and compared with its render."""
+
+from typing import Any
+
+from nerf_lightning.extensions.viewer.client import ViewerClient
+from nerf_lightning.extensions.viewer.frusta import Frusta
+from nerf_lightning.messages.escaping import as_code, for_terminal
+
+NONE = "none"
+MOST_LETTERS = 60  # Letters of a name in the list; all of it is said when it is chosen.
+
+
+class PhotographPanel:
+    """Let one person choose a photograph, and compare it; meanwhile the cameras over the picture are hidden."""
+
+    def __init__(self, session: ViewerClient, frusta: Frusta):
+        self.session, self.frusta = session, frusta
+        self.names = session.photographs.record.view_names
+        gui, harmless = session.client.gui, session.queue.errors.harmless
+        labels = (f"{view}: {for_terminal(name, MOST_LETTERS)}" for view, name in enumerate(self.names))
+        with gui.add_folder("Photographs", expand_by_default=False):
+            visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
+            self.choice = gui.add_dropdown("View from", (NONE, *labels), initial_value=NONE)
+            self.name = gui.add_markdown("", visible=False)
+            self.split = gui.add_slider(
+                "Photograph | render", 0.0, 1.0, 0.01, session.split, visible=False, hint="Left is the photograph"
+            )
+            self.leave = gui.add_button("Leave", visible=False)
+        visible.on_update(harmless(lambda _: self.frusta.show(visible.value)))
+        self.choice.on_update(harmless(self._choose))
+        self.split.on_update(harmless(self._compare))
+        self.leave.on_click(harmless(lambda _: session.leave()))
+        session.on_leave = self._left
+        session.photographs.when_read.append(harmless(self._show_anew))
+
+    def enter(self, view: int) -> None:
+        """Look through the camera of a view."""
+        there = self.session.photographs.has(view)
+        self.name.content = f"Camera of {as_code(self.names[view])}" + (
+            "" if there else " (its photograph is not available)"
+        )
+        self.choice.value = self.choice.options[view + 1]
+        self.name.visible = self.leave.visible = True
+        self.split.visible = there
+        self.frusta.hide(True)
+        self.session.enter(view)
+
+    def _choose(self, event: Any) -> None:
+        if event.client is None:  # the program has set it
+            return
+        if self.choice.value == NONE:
+            self.session.leave()
+        else:
+            self.enter(self.choice.options.index(self.choice.value) - 1)
+
+    def _compare(self, _: Any) -> None:
+        self.session.split = self.split.value
+        self.session.present()
+
+    def _show_anew(self) -> None:
+        self.frusta.has_cameras = False
+        self.frusta.show(self.frusta.cameras.visible)
+
+    def _left(self) -> None:
+        self.choice.value = NONE
+        self.name.visible = self.leave.visible = self.split.visible = False
+        self.frusta.hide(False)

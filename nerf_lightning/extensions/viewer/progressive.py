@@ -1,0 +1,99 @@
+"""One person's picture: coarse at once, then finer and finer while the wish stays the same."""
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
+from nerf_lightning.extensions.viewer.camera_state import CameraState
+from nerf_lightning.extensions.viewer.renderer import SlicedRenderer, View
+
+# Each picture has so many times the height of the one before; the last one may have more.
+FINER, AT_MOST_FINER = 2, 2.5
+# A picture has at most this many times most_height x most_height pixels; windows wider than 4:1 get a coarser one.
+MOST_SQUARES = 4
+
+
+@dataclass(frozen=True)
+class Job:
+    """A picture that is being rendered."""
+
+    look: CameraState
+    height: int
+    is_coarse: bool
+    slices: Generator[None, None, View]
+
+
+class ProgressiveRendering:
+    """Render what is wished, a slice at a time.
+
+    A finer picture whose wish has changed is dropped between two slices. A coarse one is finished and shown: it is
+    small, and somebody who never stops moving would see nothing otherwise.
+
+    Wishes come from other threads than the one that renders; a wish is one reference, so no lock is needed. `show`
+    takes each finished view, and whether it is the finest; none is higher than `most_height` pixels.
+    """
+
+    def __init__(self, show: Callable[[View, CameraState, bool], None], most_height: int = 720):
+        self.show, self.most_height = show, most_height
+        self.wish: CameraState | None = None
+        self.shown: CameraState | None = None
+        self.shown_height = 0
+        self.is_stale = False
+        self.served = 0.0
+        """When it last had a turn (queue's clock)."""
+        self._job: Job | None = None
+        self._tried: CameraState | None = None
+        """Of the last job."""
+
+    def ask(self, look: CameraState) -> None:
+        """Wish for another look."""
+        self.wish = look
+
+    def refresh(self) -> None:
+        """Render the finest picture once more: the model has changed, or somebody wants to keep it."""
+        self.is_stale = True
+
+    def give_up(self) -> None:
+        """Drop what could not be rendered or shown, and wait for another wish, or for another model."""
+        self.shown, self.shown_height = self._tried, self.most_height
+        self._job = None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether nothing at all has been shown of the present wish."""
+        return self.wish is not self.shown
+
+    def work(self, renderer: SlicedRenderer) -> bool:
+        """Render a slice; return False where nothing is left to do."""
+        if self._job is not None and self._job.look is not self.wish and not self._job.is_coarse:
+            self._job.slices.close()
+            self._job = None
+        if self._job is None:
+            self._job = self._next_job(renderer)
+        if self._job is None:
+            return False
+        try:
+            next(self._job.slices)
+        except StopIteration as end:
+            job, self._job = self._job, None
+            self.shown, self.shown_height = job.look, job.height
+            self.show(end.value, job.look, job.height == self._full_height(job.look))
+        return True
+
+    def _next_job(self, renderer: SlicedRenderer) -> Job | None:
+        look = self._tried = self.wish
+        if look is None:
+            return None
+        full = self._full_height(look)
+        if look is not self.shown:
+            height = min(full, renderer.height_while_moving(look))
+            return Job(look, height, True, renderer.slices(look, height))
+        if self.shown_height >= full and not self.is_stale:
+            return None
+        height = full if AT_MOST_FINER * self.shown_height >= full else FINER * self.shown_height
+        if height == full:
+            self.is_stale = False
+        return Job(look, height, False, renderer.slices(look, height))
+
+    def _full_height(self, look: CameraState) -> int:
+        widest = int(self.most_height * (MOST_SQUARES * look.height / look.width) ** 0.5)
+        return max(1, min(look.height, self.most_height, widest))

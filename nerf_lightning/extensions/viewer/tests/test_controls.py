@@ -1,0 +1,137 @@
+"""The panel: what is saved where it can be, and what is not there is said."""
+
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.viewer_panel import Panel
+
+from nerf_lightning.extensions.viewer import controls
+from nerf_lightning.extensions.viewer.export_panel import exported_files
+from nerf_lightning.messages.escaping import as_code, for_terminal
+
+
+def snapshot(panel):
+    """Click, wait for the picture, and return what the page says."""
+    panel.press("Snapshot")
+    panel.work()
+    (title, text), _ = panel.client.add_notification.call_args
+    assert title == "Snapshot"
+    return text
+
+
+def test_a_snapshot_makes_its_folder_and_says_where_it_is(tmp_path):
+    panel = Panel(tmp_path / "viewer")
+    panel.work()
+    assert not list(tmp_path.iterdir())
+    assert snapshot(panel) == f"Saved as {tmp_path}/viewer/snapshot_001.png"
+    assert snapshot(panel) == f"Saved as {tmp_path}/viewer/snapshot_002.png"
+    assert len(list((tmp_path / "viewer").iterdir())) == 2
+
+
+def test_the_size_of_the_picture_is_on_the_panel():
+    panel = Panel(Path())
+    panel.session.on_picture(6, 8, False)
+    assert panel.controls.status.content == "8 x 6 pixels, refining"
+    panel.work()
+    assert panel.controls.status.content == "16 x 12 pixels"
+
+
+def test_a_full_disk_is_said_and_ends_nothing(tmp_path, monkeypatch):
+    def full(path, picture):
+        raise OSError(28, "No space left on device", str(path))
+
+    panel = Panel(tmp_path)
+    monkeypatch.setattr(controls, "save_png", full)
+    assert "It could not be saved: [Errno 28] No space left on device" in snapshot(panel)
+    monkeypatch.undo()
+    assert snapshot(panel) == f"Saved as {tmp_path}/snapshot_001.png"
+
+
+def test_a_place_that_cannot_be_a_folder_is_said(tmp_path):
+    (tmp_path / "viewer").write_text("")
+    assert "could not be saved" in snapshot(Panel(tmp_path / "viewer" / "deeper"))
+
+
+def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):
+    panel = Panel(tmp_path)
+    monkeypatch.setattr(panel.session, "enter", lambda view: 1 / 0)
+    for _ in range(3):
+        panel.set("View from", "0: ball_0")
+    assert caplog.text.count("ZeroDivisionError") == 1
+    assert "Traceback" not in caplog.text
+
+
+def test_the_last_movement_wins_over_one_that_is_still_being_read(tmp_path):
+    panel = Panel(tmp_path)
+    session, plain, read, go = panel.session, panel.session.pose, threading.Event(), threading.Event()
+
+    def slow():
+        session.pose = plain
+        old = plain()
+        read.set()
+        assert go.wait(20)
+        return old
+
+    session.pose, session.on_move = slow, lambda: None
+    threads = [threading.Thread(target=session.look) for _ in range(2)]
+    threads[0].start()
+    assert read.wait(20)
+    panel.client.camera.position = np.array([1.0, 2.0, 3.0])
+    threads[1].start()
+    threads[1].join(0.2)
+    go.set()
+    for each in threads:
+        each.join()
+    assert session.refinement.wish.c2w[:, 3].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_the_crop_box_is_the_scenes(tmp_path):
+    panel = Panel(tmp_path)
+    assert panel.gui.made["x"].value == pytest.approx((-1.0, 1.0))
+    panel.gui.made["Show only what is in the box"].value = True
+    panel.gui.made["z"].value = (0.0, 0.5)
+    panel.gui.made["z"].act(None)
+    assert panel.session.crop.size.tolist() == pytest.approx([2.0, 2.0, 0.5])
+    assert panel.queue.work()
+
+
+def test_without_a_crop_box_it_is_said_why(tmp_path):
+    panel = Panel(tmp_path, space="ndc")
+    assert "Show only what is in the box" not in panel.gui.made
+    assert "Crop box" in panel.gui.made
+    assert any("forward-facing capture" in label for label in map(str, panel.gui.made))
+
+
+@given(st.text())
+def test_nothing_ends_the_code_span_early(text):
+    """CommonMark 6.1: a code span ends at the first run of backticks as long as the one that began it."""
+    shown = as_code(text)
+    fence = re.match("`+", shown)[0]
+    inner = shown[len(fence) : -len(fence)]
+    assert inner == f" {for_terminal(text)} "
+    assert all(len(run) != len(fence) for run in re.findall("`+", inner))
+
+
+def test_surrogates_and_line_ends_are_shown_as_something_and_long_texts_are_cut():
+    assert as_code("a\udc80\n\nb\u202e") == r"` a\udc80\n\nb\u202e `"
+    assert for_terminal("a" * 10**6, 3) == "aaa…"
+
+
+def test_exported_files_are_downloaded_and_one_that_has_gone_is_said(tmp_path):
+    assert exported_files(tmp_path / "none") == []
+    for name in ("splats.ply", ".part"):
+        (tmp_path / name).write_bytes(b"ply")
+    (tmp_path / "link.ply").symlink_to(tmp_path / "splats.ply")
+    panel = Panel(tmp_path, exports=tmp_path)
+    (button,) = (label for label in panel.gui.made if label.startswith("splats.ply ("))
+    assert not any(label.startswith("link.ply") for label in panel.gui.made)
+    panel.press(button)
+    panel.client.send_file_download.assert_called_once_with("splats.ply", b"ply")
+    (tmp_path / "splats.ply").unlink()
+    panel.press(button)
+    panel.client.send_file_download.assert_called_once()

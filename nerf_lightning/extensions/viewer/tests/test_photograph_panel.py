@@ -1,0 +1,50 @@
+"""Photographs are chosen by their names, looked through, and left."""
+
+from support.scenes import ball_scene
+from support.viewer_panel import Panel
+
+CHOICE, SPLIT = "View from", "Photograph | render"
+
+
+def test_a_photograph_is_chosen_by_its_name_looked_through_and_left(tmp_path):
+    panel = Panel(tmp_path, ball_scene(num_views=4, size=16))
+    panel.set(CHOICE, "3: ball_3")
+    assert panel.session.photograph == 3
+    assert "` ball_3 `" in panel.controls.photographs.name.content
+    panel.set(SPLIT, 0.25)
+    assert panel.session.split == 0.25
+    panel.press("Leave")
+    assert panel.session.photograph is None
+    assert panel.gui.made[CHOICE].value == "none"
+
+
+def test_a_clicked_camera_is_the_one_in_the_list(tmp_path):
+    panel = Panel(tmp_path, ball_scene(num_views=4, size=16))
+    panel.controls.frusta.on_click(2)
+    assert panel.gui.made[CHOICE].value == "2: ball_2"
+    panel.set(CHOICE, "none")
+    assert panel.session.photograph is None
+
+
+def test_without_photographs_at_hand_it_is_said(tmp_path):
+    panel = Panel(tmp_path)
+    panel.set(CHOICE, "2: ball_2")
+    assert "its photograph is not available" in panel.controls.photographs.name.content
+    assert not panel.gui.made[SPLIT].visible
+
+
+def test_photographs_that_come_later_are_on_the_cameras(tmp_path):
+    panel = Panel(tmp_path)
+    panel.set("Show cameras", True)
+    panel.session.photographs.take(ball_scene(num_views=4, size=16))
+    images = [call.kwargs["image"] for call in panel.client.scene.add_camera_frustum.call_args_list]
+    assert [image is None for image in images] == [True] * 4 + [False] * 4
+
+
+def test_a_name_is_shown_as_text(tmp_path):
+    names = ("<iframe srcdoc='<script>1</script>'></iframe>", "b\x1b[0m", "c", "d")
+    panel = Panel(tmp_path, view_names=names)
+    labels = panel.gui.made[CHOICE].options
+    assert labels[2] == "1: b\\x1b[0m"
+    panel.set(CHOICE, labels[1])
+    assert f"` {names[0]} `" in panel.controls.photographs.name.content
