@@ -1,5 +1,6 @@
 """Types of what the package offers when it is asked for (`__init__.py`)."""
 
+from nerf_lightning.data.captures.in_memory import scene_from_cameras as scene_from_cameras
 from nerf_lightning.data.datamodule import RayDataModule as RayDataModule
 from nerf_lightning.messages.errors import InputError as InputError
 from nerf_lightning.nerf.models.render_image import Picture as Picture

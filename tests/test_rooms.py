@@ -71,6 +71,20 @@ def test_there_are_few_rooms_few_arrows_and_no_circle():
     assert len(arrows) <= MOST_ARROWS, sorted(arrows)
 
 
+def imported_by_name(file: Path) -> list[str]:
+    """Modules of ours that a file imports by a string, of which import-linter knows nothing."""
+    calls = [node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    by_name = [call for call in calls if ast.unparse(call.func).endswith(("import_module", "__import__"))]
+    texts = [each.value for call in by_name for each in ast.walk(call) if isinstance(each, ast.Constant)]
+    return [text for text in texts if str(text).startswith("nerf_lightning")]
+
+
+def test_no_module_of_ours_is_imported_by_a_string(tmp_path):
+    assert {str(file): found for file in files() if (found := imported_by_name(file))} == {}
+    (tmp_path / "a.py").write_text("import importlib\nimportlib.import_module('nerf_lightning.data.rays')\n")
+    assert imported_by_name(tmp_path / "a.py") == ["nerf_lightning.data.rays"]
+
+
 def test_a_circle_is_found():
     assert circle({("a", "b"): set(), ("b", "c"): set(), ("c", "b"): set(), ("c", "d"): set()}) == ["a", "b", "c"]
 

@@ -173,7 +173,7 @@ def build_run(
 
     Args:
         *overrides: settings as on the command line, such as "scene=bricks" and "model=nerf_tiny".
-        scene: from `Scene.from_cameras` or `nl.read`, instead of the config's.
+        scene: from `scene_from_cameras` or `nl.read`, instead of the config's.
         model: your own model instead of the config's; its weights are drawn anew from the seed. Its checkpoints are
             opened by building it again, as here, with `ckpt_path`, and not by the commands.
         loss: your own loss instead of the config's.

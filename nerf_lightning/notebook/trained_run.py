@@ -44,7 +44,7 @@ def train(*overrides: str, scene: Scene | None = None) -> TrainedRun:
 
     Args:
         *overrides: settings, one string each.
-        scene: from `Scene.from_cameras` or `nl.read`, instead of the config's.
+        scene: from `scene_from_cameras` or `nl.read`, instead of the config's.
 
     Raises:
         InputError: a setting or the capture is invalid; nothing is left half-written.

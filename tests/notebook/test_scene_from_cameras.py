@@ -19,7 +19,7 @@ def test_frame_extent_and_space_are_those_of_the_reader(poses, shift, tmp_path):
     write_colmap(tmp_path, known)
     there = read("colmap", tmp_path)
     given = [each.numpy() for each in map(there.pixels.view, range(len(poses)))]
-    here = nl.Scene.from_cameras(
+    here = nl.scene_from_cameras(
         given, there.user_cameras, points=known.points, names=there.view_names, held_out=there.splits["test"]
     )
     for name in ("near", "far", "aabb", "to_user", "points"):
@@ -33,14 +33,14 @@ def test_frame_extent_and_space_are_those_of_the_reader(poses, shift, tmp_path):
 
 def test_images_are_bytes_or_shares_with_or_without_alpha_and_masks_keep_what_is_above_0():
     masks, images = orbit_masks(6, SIZE), orbit_images(6, SIZE)
-    scene = nl.Scene.from_cameras(images, orbit_cameras(), masks=masks)
+    scene = nl.scene_from_cameras(images, orbit_cameras(), masks=masks)
     assert scene.pixels.view(2)[..., :3].numpy().tolist() == images[2].tolist()
     assert scene.pixels.kept(2).numpy().tolist() == masks[2].tolist()
     assert not scene.pixels.has_transparency
-    shares = nl.Scene.from_cameras(torch.from_numpy(images).float() / 255, orbit_cameras())
+    shares = nl.scene_from_cameras(torch.from_numpy(images).float() / 255, orbit_cameras())
     assert torch.equal(shares.pixels.rgba, scene.pixels.rgba)
     clear = np.concatenate([images, np.where(masks, 255, 9).astype(np.uint8)[..., None]], axis=-1)
-    seen = nl.Scene.from_cameras(clear, orbit_cameras(), background="white")
+    seen = nl.scene_from_cameras(clear, orbit_cameras(), background="white")
     assert (seen.space, seen.background, seen.pixels.has_transparency) == ("bounded", "white", True)
 
 
@@ -58,14 +58,14 @@ def test_images_are_bytes_or_shares_with_or_without_alpha_and_masks_keep_what_is
 )
 def test_what_makes_no_scene_is_told_in_words(images, changed, parts):
     given = orbit_images(6, SIZE)[:images]
-    refused(lambda: nl.Scene.from_cameras(given, orbit_cameras(), **changed), parts=parts)
+    refused(lambda: nl.scene_from_cameras(given, orbit_cameras(), **changed), parts=parts)
 
 
 def test_a_bad_camera_or_image_is_refused_and_not_left_out():
     given, bad = orbit_images(6, SIZE), orbit_cameras()
     bad.c2w[3, 0, 0] = float("nan")
-    refused(lambda: nl.Scene.from_cameras(given, bad), parts=("view_0003", "NaN"))
-    refused(lambda: nl.Scene.from_cameras(given.astype(np.int32), orbit_cameras()), parts=("image 0", "int32", "uint8"))
+    refused(lambda: nl.scene_from_cameras(given, bad), parts=("view_0003", "NaN"))
+    refused(lambda: nl.scene_from_cameras(given.astype(np.int32), orbit_cameras()), parts=("image 0", "int32", "uint8"))
 
 
 @pytest.mark.parametrize("distortion", [None, [0.1, 0.02, 0.003, 0.004], [0.1, 0.02, 0.003, 0.004, 0.005]])

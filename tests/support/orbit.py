@@ -37,4 +37,4 @@ def orbit_cameras(count=6, **changed):
 def orbit_scene(cameras=None, space="bounded", **changed):
     """Return six views; without a lens, if no cameras are given."""
     given = orbit_cameras() if cameras is None else cameras
-    return nl.Scene.from_cameras(orbit_images(6, SIZE), given, name="orbit", space=space, **changed)
+    return nl.scene_from_cameras(orbit_images(6, SIZE), given, name="orbit", space=space, **changed)

@@ -1,6 +1,5 @@
 """How much of space is modeled, the working frame of a capture, and where along its rays content may lie."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -28,7 +27,7 @@ from nerf_lightning.nerf.geometry.world_frame import (
     up_direction,
     upright_rotation,
 )
-from nerf_lightning.nerf.types.scene import Cameras, Scene, Space
+from nerf_lightning.nerf.types.scene import Cameras, Space
 
 # The near plane lies at this share of the least depth (LLFF's bound factor).
 NEAR_SHARE = 0.75
@@ -51,13 +50,6 @@ UNIT_BALL_HALF = 3**-0.5
 # The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
 # normalized device coordinates.
 LEAST_AHEAD = 0.1
-CONTRACTED_SIDE = 4.0
-"""Of the cube that holds contracted space."""
-COARSEST_LEVEL, FINEST_LEVEL = 9, 12
-LEAST_DISTANCE = 0.1
-"""Of a camera from what it shows, in units of the farthest camera's."""
-IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
-"""The models of model=auto."""
 
 
 def choose_space(
@@ -322,29 +314,3 @@ def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor,
     zeros = torch.zeros(cameras.c2w.shape[0])
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros + 1.0).map(lambda x: x.flatten(0, 1))
     return torch.cat([rays.origins, rays.origins + rays.far[:, None] * rays.directions]), rays.far.max()
-
-
-def model_for(scene: Scene) -> tuple[str, str]:
-    """Return the model that suits a scene, as model=auto chooses it, and why."""
-    if scene.space == "bounded":
-        return IN_A_BOX, "the scene is in a box"
-    return PHOTOGRAPHS, "the photographs show a background"
-
-
-def grid_for(scene: Scene) -> int:
-    """Return the finest resolution of a hash grid whose cells are as small as the pixels.
-
-    Half of the pixels are at least as wide, where they see the scene, as a cell: of the cube from -2 to 2 that all of
-    space is contracted to, or of normalized device coordinates, in which a picture has width 2. They see it where
-    sparse points or depths say; where there are none, as far away as the middle of the scene.
-    """
-    cameras, train = scene.cameras, torch.tensor(scene.splits["train"])
-    if scene.space == "ndc":
-        cells = torch.maximum(cameras.width, cameras.height)[train].double()
-    elif scene.depths is not None:
-        cells = CONTRACTED_SIDE * cameras.focal.mean(dim=-1)[scene.depths.pixels.view] / scene.depths.distance
-    else:
-        distance = cameras.c2w[train, :, 3].norm(dim=-1).clamp(min=LEAST_DISTANCE)
-        cells = CONTRACTED_SIDE * cameras.focal.mean(dim=-1)[train] / distance
-    levels = math.ceil(math.log2(float(cells.median())))
-    return 1 << min(max(levels, COARSEST_LEVEL), FINEST_LEVEL)

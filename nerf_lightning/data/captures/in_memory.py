@@ -1,4 +1,4 @@
-"""A scene of images and cameras that are in memory already (`Scene.from_cameras`)."""
+"""A scene of images and cameras that are in memory already."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
-SOURCE = "Scene.from_cameras"
+SOURCE = "scene_from_cameras"
 
 
 class InMemoryReader(Reader):
@@ -60,7 +60,25 @@ def scene_from_cameras(
     far: float | None = None,
     name: str = "in_memory",
 ) -> Scene:
-    """Return the scene; see `Scene.from_cameras`."""
+    """Return a scene of images and cameras in memory; frame, extent and space follow from them as from a capture.
+
+    Args:
+        images: a list or an array of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
+            sizes may differ.
+        cameras: one per image, in the user's own frame and units (float64 where that is a map's).
+        points: sparse points in that frame, (points, 3), which tell where the content lies; None: unknown.
+        masks: for each image (height, width), above 0 where a pixel is learned from and judged; None: everywhere.
+        background: what lies behind the scene: white, black, random or none; None: black.
+        names: of the views; None: view_0000 and so on.
+        held_out: numbers of the views for evaluation, from which nothing is learned; none: `val` and `test` are empty.
+        space: `bounded`, `contracted`, `ndc` or `auto`, as in `nl.read`.
+        near: nearest distance of the content from the cameras, in the user's units; None: it is estimated.
+        far: the farthest.
+        name: of the scene.
+
+    Raises:
+        InputError: images, masks and cameras that do not fit together, or no scene.
+    """
     check_extent(space, near, far)
     count = len(images)
     names = [f"view_{number:04d}" for number in range(count)] if names is None else [str(each) for each in names]

@@ -40,7 +40,7 @@ def scene_of(dataset: Any) -> nl.Scene:
     images = [convert_image_dtype(image[part], np.uint8) for image, part in zip(dataset["images"], parts, strict=True)]
     clear = any(image.shape[-1] == 4 and image.min(axis=(0, 1))[3] < 255 for image in images)
     bounds = cameras.nears_fars if clear else None  # of photographs, cameras and points tell more
-    return nl.Scene.from_cameras(
+    return nl.scene_from_cameras(
         images,
         cameras_of(cameras),
         points=dataset.get("points3D_xyz"),

@@ -1,9 +1,8 @@
 """What a reader returns: cameras, pixels, and where the content lies."""
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
@@ -243,33 +242,3 @@ class Scene(SceneRecord):
     """Photographs of the capture that have no pose, and so are no views."""
     refined: bool = False
     """Whether its cameras learn with the model, or have learned: they stand near where the photographs were taken."""
-
-    @classmethod
-    def from_cameras(
-        cls,
-        images: Any,
-        cameras: Cameras,
-        points: Any = None,
-        masks: Any = None,
-        background: str | None = None,
-        **settings: Any,
-    ) -> "Scene":
-        """Return a scene of images and cameras in memory; frame, extent and space follow from them as from a capture.
-
-        Args:
-            images: a list or an array of (height, width, 3 or 4), uint8 or floats in [0, 1], with straight alpha; their
-                sizes may differ.
-            cameras: one per image, in the user's own frame and units (float64 where that is a map's).
-            points: sparse points in that frame, (points, 3), which tell where the content lies; None: unknown.
-            masks: for each image (height, width), above 0 where a pixel is learned from and judged; None: everywhere.
-            background: what lies behind the scene: white, black, random or none; None: black.
-            **settings: `names` of the views; `held_out`, the numbers of the views that are not learned from but judged
-                by (none: `val` and `test` are empty); `space`, `near`, `far` and `name` as in `nl.read`.
-
-        Raises:
-            InputError: images, masks and cameras that do not fit together, or no scene.
-        """
-        # By name: this package imports nothing that reads captures.
-        reader = importlib.import_module("nerf_lightning.data.captures.in_memory")
-        scene: Scene = reader.scene_from_cameras(images, cameras, points, masks, background, **settings)
-        return scene

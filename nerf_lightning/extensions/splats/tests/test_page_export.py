@@ -11,7 +11,6 @@ from support.running import refused
 from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.extensions.splats.page import PageExport
-from nerf_lightning.extensions.splats.page_file import is_page
 
 NAME = '</script><script>alert(1)</script><img src=x onerror="alert(2)">'
 
@@ -110,13 +109,13 @@ def test_what_is_no_page_of_ours_is_not_written_over(tmp_path):
 
 
 def test_a_page_is_known_by_its_beginning(page, tmp_path):
-    assert is_page(page)
+    assert is_scene_page(page)
     other = tmp_path / "other.html"
     other.write_text("<html></html>")
-    assert not is_page(other)
+    assert not is_scene_page(other)
     if hasattr(os, "mkfifo"):  # not on Windows
         os.mkfifo(tmp_path / "pipe.html")
-        assert not is_page(tmp_path / "pipe.html")  # nobody writes: it would wait for ever
+        assert not is_scene_page(tmp_path / "pipe.html")  # nobody writes: it would wait for ever
 
 
 def test_a_negative_number_of_photographs_is_refused():

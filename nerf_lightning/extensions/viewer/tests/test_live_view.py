@@ -14,8 +14,7 @@ from support.ports import unused_port
 from support.running import FAST, start
 from support.viser_client import ViserClient
 
-from nerf_lightning.commands.train_job import live_view
-from nerf_lightning.extensions.viewer import training_switch
+from nerf_lightning.extensions.viewer import live_view, training_switch
 from nerf_lightning.extensions.viewer.camera_state import CameraState
 from nerf_lightning.extensions.viewer.live_view import LiveView
 from nerf_lightning.extensions.viewer.page import Page

@@ -16,7 +16,7 @@ from support.running import said, start
 from support.viser_client import ViserClient
 
 from nerf_lightning.cli.prepare import prepared
-from nerf_lightning.commands import view
+from nerf_lightning.extensions.viewer.commands import view
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 
