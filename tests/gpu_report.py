@@ -19,9 +19,9 @@ from support.configs import composed, options
 from support.gpu_targets import DEVICES, compiled_for, resources
 from support.gpu_training import small, step_by_step
 from support.launches import KERNEL, Launches
+from support.peak_bytes import PeakBytes
 from support.stand_in_device import StandInDevice
 
-from nerf_lightning.commands.train_job.memory_trial import PeakBytes
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 
 OTHERS = ("auto", "view_transformer", "view_transformer_tiny")

@@ -63,7 +63,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
         ("gpu", "\n  trainer=gpu  "),
         ("learning rate", "  optimizer.lr  "),
         ("batch size", "  data.batch_rays  "),
-        ("out of memory", "prints the memory plan before training"),
+        ("out of memory", "prints before training how much memory"),
     ],
 )
 def test_words_that_name_nothing_are_looked_for_in_meanings_and_symptoms(nerf, words, found):

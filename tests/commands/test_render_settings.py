@@ -11,13 +11,13 @@ import psutil
 import pytest
 import torch
 from support.known_fields import INSIDE, solid
+from support.peak_bytes import peak_bytes
 from support.running import FAST, said, start
 from support.scenes import ball_scene, tiny_field
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.cli import main as cli
-from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras

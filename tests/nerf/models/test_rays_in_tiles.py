@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.peak_bytes import peak_bytes
 from support.scenes import LENSES, ball_scene, tiny_model
 
-from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import resized

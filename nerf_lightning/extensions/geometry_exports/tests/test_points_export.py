@@ -8,11 +8,11 @@ import pytest
 import torch
 import trimesh
 from support.known_fields import ball, solid
+from support.peak_bytes import peak_bytes
 from support.posed_captures import Known, read, wall, write_llff
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.export.visibility import num_agreeing, see
 from nerf_lightning.extensions.geometry_exports.points import (
     BYTES_PER_PIXEL,
