@@ -74,7 +74,7 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     used = [state["used"] for state in content["callbacks"].values() if "used" in state]
     assert used
     assert used[0] >= 0.75
-    assert "1 s (budget.seconds) of steps of" in output
+    assert "training: 1 s (budget.seconds), " in output
     assert f"{content['global_step']} steps in " in output
 
 

@@ -28,7 +28,7 @@ def sections(text):
 def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     path, output = page_of_run
     text = path.read_text()
-    assert sections(text) == ["video", "worst", "views", "steps", "curves", "capture", "numbers", "config"]
+    assert sections(text) == ["video", "worst", "steps", "curves", "capture", "numbers", "config"]
     assert f"report       {path}" in output
     assert "left out" not in output
     metrics = json.loads((finished_run / "metrics.json").read_text())

@@ -282,7 +282,7 @@ def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypat
     monkeypatch.setenv("COLUMNS", str(width))
     result, _rows = table()
     lines = result.out.splitlines()
-    end = next(number for number, line in enumerate(lines) if line.startswith("The terminal "))
+    end = next(number for number, line in enumerate(lines) if line.startswith("Columns left out: "))
     assert max(map(len, lines[:end])) <= width
     assert result.out.count("20.50 ± 0.71") == 3
     rule = next(number for number, line in enumerate(lines) if line.startswith("─"))

@@ -289,9 +289,7 @@ def test_a_hole_in_a_ring_of_views_is_noted():
     cameras = replace(scene.cameras[kept], lens_model="pinhole")
     evidence = gather_evidence(ball_scene(12, 12))
     evidence = replace(evidence, scene=replace(evidence.scene, cameras=cameras))
-    judged(
-        evidence, "coverage", "look", "gap of 112 degrees", "Take 12 more photographs between where ball_11 and ball_0"
-    )
+    judged(evidence, "coverage", "look", "gap of 112 degrees", "Take 12 more photographs between ball_11 and ball_0")
 
 
 @pytest.mark.data

@@ -11,6 +11,7 @@ from support.running import refused
 from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.extensions.splats.page import PageExport
+from nerf_lightning.files.html import is_scene_page
 
 NAME = '</script><script>alert(1)</script><img src=x onerror="alert(2)">'
 
