@@ -75,7 +75,7 @@ def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     told = {key: list(mapping(metrics.get(key)).items())[:MOST_PAIRS] for key in titles}
     pairs = {key: [(name.replace("_", " ")[:80], _said(value)) for name, value in found] for key, found in told.items()}
     if pairs["protocol"] and metrics.get("lpips") is None:
-        pairs["protocol"] = [*pairs["protocol"], ("LPIPS", WITHOUT_LPIPS)]
+        pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "lpips"), ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]
 
 

@@ -3,7 +3,7 @@
 import logging
 from dataclasses import dataclass
 
-from nerf_lightning.compute.machine import free_memory, held_memory
+from nerf_lightning.compute.machine import free_memory
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
 from nerf_lightning.nerf.encoders.base import matrices_of
@@ -15,8 +15,6 @@ from nerf_lightning.training.step import TrainStep
 # A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
 # rows as a rule (products.py: pad_rows), and kept: 0.7 MB each.
 COMPILED_PER_MATRIX = 3 * 2 * 700_000
-# A run that takes a smaller share of what is free needs no word.
-SMALL = 0.1
 # Bytes per ray, per pixel, and per point beside its features, each of which is kept a few times over.
 RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 128, 1_024, 6
 # And per pixel of a chunk of rows.
@@ -61,16 +59,11 @@ def needs(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule)
 
 
 def announce_memory(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> None:
-    """Log the bound where it is not small, its parts as details (-v), and warn where memory may be short."""
+    """Warn where memory may be short; the parts are details (-v)."""
     free, parts = free_memory(settings.device), needs(settings, train_step, data)
     most = sum(need.num_bytes for need in parts)
     for need in parts:
         log.debug("memory: at most %.3f GB for %s", need.num_bytes / GIGABYTE, need.what)
-    if most > SMALL * free:
-        log.info(
-            "memory: at most %.1f GB on top of the %.1f GB in use by this process; %.1f GB are free (-v: more)",
-            *(size / GIGABYTE for size in (most, held_memory(settings.device), free)),
-        )
     if TAKEN * most > free:
         largest = max(parts, key=lambda need: need.num_bytes)
         log.warning(
