@@ -36,6 +36,8 @@ OF_ITSELF = {
 VERBOSE = ("-v", "--verbose")
 DETAILS = "hydra.verbose=[nerf_lightning]"
 """What they stand for: the details that our own modules log."""
+JSON, AS_JSON = "--json", "json=true"
+"""Of commands that print a table, and what it stands for."""
 HELP = """nerf: train radiance fields from photographs and render new views.
 
 usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
@@ -157,7 +159,7 @@ def _run(command: str, arguments: list[str]) -> None:
         from nerf_lightning.config.hydra_versions import hydra_main
         from nerf_lightning.config.search_path import search_extensions
 
-        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments], command)
+        arguments = options_first([_setting_of(word) for word in arguments], command)
         require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)
         arguments = quoted_paths(arguments, is_sweep(arguments))
@@ -171,6 +173,10 @@ def _run(command: str, arguments: list[str]) -> None:
             watched(run)
         else:
             run()
+
+
+def _setting_of(word: str) -> str:
+    return DETAILS if word in VERBOSE else AS_JSON if word == JSON else word
 
 
 @contextmanager

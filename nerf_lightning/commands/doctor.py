@@ -20,7 +20,7 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import child_of
-from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken
+from nerf_lightning.messages.console import StdoutConsole, say, say_json, say_written, spoken
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
@@ -39,19 +39,24 @@ def run(config: DictConfig) -> int:
     folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
     rows = [{key: getattr(check, key) for key in ("name", "verdict", "message", "cure")} for check in checks]
-    write_json(folder / "doctor.json", {"scene": scene.name, "capture": about, "checks": rows})
+    result = {"scene": scene.name, "capture": about, "checks": rows}
+    write_json(folder / "doctor.json", result)
     save_png(folder / "doctor.png", doctor_picture(evidence, checks, about))
     written = [folder / "doctor.json", folder / "doctor.png"]
     proofs = [proof for check in checks for proof in check.proofs]
     if proofs:
         written.append(folder / "doctor_proof.png")
         save_png(written[-1], proof_picture(scene, proofs))
+    wrongs = sum(check.verdict == "wrong" for check in checks)
+    if config.json:
+        say_json(result | {"written": written})
+        return wrongs
     say(*wrap(f"capture  {about}", terminal_width(UNWRAPPED), subsequent_indent=" " * 9))
     print_checks(checks)
     seconds = time.monotonic() - started
     say(f"{summary(checks)}; {len(scene.view_names)} views examined in {spoken(seconds)}")
     say_written(*written)
-    return sum(check.verdict == "wrong" for check in checks)
+    return wrongs
 
 
 def _origin(config: DictConfig, reader: Any) -> tuple[str | None, str]:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.exporters import build_exporter
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
@@ -50,7 +52,7 @@ def export(config: DictConfig) -> list[Path]:
     """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
     if not ranks.is_first():
         return []
-    what: Export = build(config.what)
+    what: Export = build_exporter(config, str(HydraConfig.get().runtime.choices.get("what")))
     path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)

@@ -17,7 +17,7 @@ from nerf_lightning.compute.precision import has_tf32
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
-from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken, stderr_console
+from nerf_lightning.messages.console import StdoutConsole, say, say_json, say_written, spoken, stderr_console
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.command_folder import output_folder
@@ -46,16 +46,24 @@ def run(config: DictConfig) -> None:
     settings.prepare_machine()
     folder = output_folder(config.paths.output_dir, Path(config.paths.root_dir) / "selftest")
     rows = _rows(settings)
-    StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {settings.describe()}"))
-    counts = ", ".join(f"{sum(row.outcome == each for row in rows)} {each}" for each in ("ok", "wrong", "not run"))
-    say(*remarks(rows), f"{counts}; {spoken(time.perf_counter() - began)}")
     known = {"nerf_lightning": __version__} | environment() | machine(settings.device)
-    say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in known.items()))
     result = {"right": all(row.outcome != "wrong" for row in rows), "device": settings.describe(), "machine": known}
-    write_json(folder / "selftest.json", result | {"checks": [asdict(row) for row in rows]})
-    say_written(folder / "selftest.json")
+    result |= {"checks": [asdict(row) for row in rows]}
+    write_json(folder / "selftest.json", result)
+    if config.json:
+        say_json(result | {"written": [folder / "selftest.json"]})
+    else:
+        _print(rows, settings.describe(), known, time.perf_counter() - began)
+        say_written(folder / "selftest.json")
     if not result["right"]:
         raise SystemExit(1)
+
+
+def _print(rows: list[Row], device: str, known: dict[str, Any], seconds: float) -> None:
+    StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {device}"))
+    counts = ", ".join(f"{sum(row.outcome == each for row in rows)} {each}" for each in ("ok", "wrong", "not run"))
+    say(*remarks(rows), f"{counts}; {spoken(seconds)}")
+    say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in known.items()))
 
 
 def _rows(settings: TrainerSettings) -> list[Row]:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.error_messages import in_words
+from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import flatten, quoted
 from nerf_lightning.files.folders import conf_file, option_names
@@ -38,6 +39,18 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     return {str(name): _exporter(str(name), value) for name, value in asked.items()}
 
 
+def build_exporter(config: DictConfig, name: str) -> Any:
+    """Build the exporter of a config of `nerf export`, whose user asked for `what=NAME`.
+
+    Raises:
+        InputError: there is none of this name, or a setting makes no sense.
+    """
+    if "what" not in config:  # the group is optional, so Hydra lets an unknown name pass
+        known = option_names("what")
+        raise InputError(f"There is no what={name}.{did_you_mean(name, known, 'what=')} Known are {', '.join(known)}.")
+    return build(config.what)
+
+
 def _exporter(name: str, asked: Any) -> Any:
     if asked is not True and not isinstance(asked, DictConfig):
         raise InputError(f"final.{name}={asked}: give true, or settings of nerf export: final.{name}.KEY=VALUE.")
@@ -45,7 +58,7 @@ def _exporter(name: str, asked: Any) -> Any:
     overrides = [f"what.{key}={quoted(value)}" for key, value in settings.items()]
     try:
         with in_words("export"):
-            return build(compose_config("export", [f"what={name}", *overrides])[0].what)
+            return build_exporter(compose_config("export", [f"what={name}", *overrides])[0], name)
     except InputError as error:
         raise InputError(f"final.{name}: {error}") from error
 

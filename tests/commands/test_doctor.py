@@ -58,6 +58,13 @@ def test_a_good_capture(corner, doctor, tmp_path):
     assert "0 wrong; 10 views examined in" in result.out
 
 
+def test_json_is_all_that_is_printed(corner, doctor):
+    result, checks = doctor(corner(), "--json")
+    printed = json.loads(result.out)
+    assert {check["name"]: check for check in printed["checks"]} == checks
+    assert [path.rpartition("/")[2] for path in printed["written"]] == ["doctor.json", "doctor.png"]
+
+
 def test_opencv_axes_are_printed_with_their_cure_in_the_width_of_the_terminal(corner, doctor, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     result, checks = doctor(corner(lambda poses: poses * [1.0, -1.0, -1.0, 1.0]))

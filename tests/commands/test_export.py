@@ -32,22 +32,6 @@ def test_images_are_written_where_it_is_said(nerf, last, tmp_path):
     assert len(json.loads((tmp_path / "images.json").read_text())["views"]) == 2
 
 
-def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, finished_run, tmp_path):
-    where = f"paths.output_dir={tmp_path}"
-    result = nerf("export", f"ckpt={last}", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2", where)
-    if result.code:  # 20 steps may leave a field without anything in it
-        said(result, "There is no surface to put splats on")
-        return
-    assert "dB on 1 test view, the field" in result.out
-    assert f"{tmp_path}/page.html" in result.out
-    text = (tmp_path / "page.html").read_text()
-    psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]
-    assert f"{psnr:.2f} dB" in text
-    assert text.count('alt="ball_') + text.count('<button type="button" data-view') >= 8
-    (tmp_path / "page.html").write_text("something else")
-    said(nerf("export", f"ckpt={last}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR")
-
-
 def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs_where_there_are_any(nerf, last, capture, tmp_path):
     searched = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
     given = ("export", searched, f"ckpt={last}", "what=mean_colors", f"paths.output_dir={tmp_path}")
@@ -67,17 +51,18 @@ def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs_where_there_
 
 def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     where = f"paths.output_dir={tmp_path}"
-    said(nerf("export", f"ckpt={tmp_path}/absent.ckpt", where), "There is no checkpoint at")
-    unwritten = nerf("export", f"ckpt={last}", "what=page", "paths.output_dir=/dev/null/x")
+    said(nerf("export", f"ckpt={tmp_path}/absent.ckpt", "what=images", where), "There is no checkpoint at")
+    unwritten = nerf("export", f"ckpt={last}", "what=images", "paths.output_dir=/dev/null/x")
     said(unwritten, "The output folder /dev/null/x cannot be written", "paths.output_dir=DIR")
-    said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "page")
-    said(nerf("export", f"ckpt={last}", "what.sh_degree=many", where), "what.sh_degree=many is not valid")
+    said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "cameras")
+    several = nerf("export", f"ckpt={last}", "what=images", "what.max_views=many", where)
+    said(several, "what.max_views=many is not valid")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("what", "name", "kind"),
-    [("cameras", "sparse", "file"), ("images", "normals", "file"), ("page", "page.html", "folder")],
+    [("cameras", "sparse", "file"), ("images", "normals", "file"), ("images", "images.json", "folder")],
 )
 def test_what_lies_where_something_is_to_be_written_is_said_before_the_work(nerf, last, tmp_path, what, name, kind):
     place = tmp_path / name

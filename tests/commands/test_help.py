@@ -41,7 +41,7 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
     assert "scene.images=null\n" in result.out
     assert "scene.masks_keep=white\n" in result.out
     assert "Takes 'white' | 'black'." in result.out
-    assert "what.title=null" in nerf("help", "what.title").out
+    assert "what.depth=" in nerf("help", "what.depth").out
     assert nerf("help", "export").out == nerf("export", "--help").out
     assert "scene (default the run's)" in nerf("eval", "--help").out
     told = " ".join(nerf("help", "scene.near").out.split())
@@ -73,7 +73,7 @@ def test_words_that_name_nothing_are_looked_for_in_meanings_and_symptoms(nerf, w
 def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
     told = nerf("help", "ckpt").out
     assert "nerf eval: ckpt=(required)\n    The run folder or checkpoint to evaluate." in told
-    assert "nerf view: ckpt=(required)\n    The run folder or checkpoint to show." in told
+    assert "nerf render: ckpt=(required)\n    The run folder or checkpoint to render, or several" in told
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,11 @@ class Command:
     def __init__(self, name: str, file: CommentedYaml):
         self.name = name
         self.template = file.entries["hydra.help.template"].text
-        self.groups = {group: name for group, name in file.defaults if group not in ("_self_", "hydra")}
+        self.groups = {
+            group: name if name in option_names(group.partition("@")[0]) else None
+            for group, name in file.defaults
+            if group not in ("_self_", "hydra")
+        }
         """With the option of the command's defaults list, in its order."""
         places = {place(group) for group in self.groups}
         own = {key: entry for key, entry in file.entries.items() if root(key) != "hydra"}

@@ -51,7 +51,10 @@ def read_commented(file: Path) -> CommentedYaml:
 def _defaults(listed: yaml.Node) -> Iterator[tuple[str, str | None]]:
     for item in listed.value:
         for group, name in item.value if isinstance(item, yaml.MappingNode) else [(item, None)]:
-            yield group.value, None if name is None or name.tag.endswith("null") else name.value
+            yield (
+                group.value.removeprefix("optional "),
+                None if name is None or name.tag.endswith("null") else name.value,
+            )
 
 
 def _entries(section: list[tuple[yaml.Node, yaml.Node]], prefix: str, lines: list[str]) -> Iterator[tuple[str, Entry]]:

@@ -35,7 +35,7 @@ from nerf_lightning.extensions.bench.stages import (
 )
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.console import StdoutConsole, say_written, stderr_console
+from nerf_lightning.messages.console import StdoutConsole, say_json, say_written, stderr_console
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.plan_run import read_scene
 
@@ -66,10 +66,13 @@ def run(config: DictConfig) -> float:
         "peak_memory_gigabytes": peak,
         "rounds": config.rounds,
     }
-    _print_table(result)
     folder = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
     write_json(folder / "bench.json", result)
-    say_written(folder / "bench.json")
+    if config.json:
+        say_json(result | {"written": [folder / "bench.json"]})
+    else:
+        _print_table(result)
+        say_written(folder / "bench.json")
     return float(result["training rays/s"]["median"])
 
 

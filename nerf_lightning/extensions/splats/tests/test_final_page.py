@@ -183,3 +183,23 @@ def test_nothing_is_taken_through_a_link(tmp_path):
     run.mkdir()
     (run / "viewer").symlink_to(tmp_path / "elsewhere")
     assert len(page_path(AutoPath(), record_of(all_around()), run)) == 25
+
+
+def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, finished_run, tmp_path):
+    where = f"paths.output_dir={tmp_path}"
+    result = nerf(
+        "export", f"ckpt={finished_run}", "what.num_splats=200", "what.max_views=1", "what.seconds=0.2", where
+    )
+    if result.code:  # 20 steps may leave a field without anything in it
+        said(result, "There is no surface to put splats on")
+        return
+    assert "dB on 1 test view, the field" in result.out
+    assert f"{tmp_path}/page.html" in result.out
+    text = (tmp_path / "page.html").read_text()
+    psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]
+    assert f"{psnr:.2f} dB" in text
+    assert text.count('alt="ball_') + text.count('<button type="button" data-view') >= 8
+    (tmp_path / "page.html").write_text("something else")
+    said(
+        nerf("export", f"ckpt={finished_run}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR"
+    )
