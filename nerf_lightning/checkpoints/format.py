@@ -1,4 +1,4 @@
-"""What a checkpoint is, key by key: what is written and what is read are held against the same annotations."""
+"""The format of a checkpoint, key by key: writing and reading check against the same annotations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 FORMAT = 7
 KEY = "nerf_lightning"
 PARTS = ("model.", "rays.", "correction.", "loss.")
-"""Of a training step: what their weights' names begin with."""
+"""Parts of a training step: the prefixes of their weights' names."""
 LOOPS = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
 """Lightning's."""
 LIGHTNING = "pytorch-lightning_version"
@@ -58,15 +58,16 @@ TRAINING: dict[str, Any] = {
     "optimizer_states": list[dict[str, object]],
     "lr_schedulers": list[object],
 }
-"""What training goes on from, beside the record; the run that does holds it against its own (`training/restore.py`)."""
+"""What training resumes from, besides the record; the resuming run checks it against its own
+(`training/restore.py`)."""
 OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
-"""What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
+"""What `save_hyperparameters` of a user's subclass adds; nothing here reads it."""
 OF_AVERAGING: dict[str, Any] = {"current_model_state": dict[str, Tensor], "averaging_state": dict[str, Tensor]}
-"""What Lightning's WeightAveraging adds and restores; `state_dict` has the averages then."""
+"""What Lightning's WeightAveraging adds and restores; `state_dict` then holds the averages."""
 
 
 def require_our_format(content: Mapping[str, Any], path: Path) -> None:
-    """Refuse a file that is no checkpoint of this program, or one of another format.
+    """Refuse a file that is not a checkpoint of this program, or has another format.
 
     Raises:
         InputError: in either case.
@@ -86,11 +87,11 @@ def require_our_format(content: Mapping[str, Any], path: Path) -> None:
 
 
 def require_checkpoint(content: dict[str, Any], where: str) -> None:
-    """Hold a checkpoint against what one is.
+    """Check a checkpoint against the format.
 
     Raises:
-        Mismatch: the first key that is missing, unknown, or not what it must be.
-        InputError: more than the budgets allow.
+        Mismatch: names the first key that is missing, unknown or invalid.
+        InputError: it exceeds the budgets.
     """
     require_fit(content, FILE, "", TRAINING | OF_SUBCLASSES | OF_AVERAGING)
     for name in content["state_dict"]:
@@ -109,7 +110,7 @@ def require_checkpoint(content: dict[str, Any], where: str) -> None:
 
 
 def scene_of(record: Mapping[str, Any]) -> SceneRecord:
-    """Return the scene in a checkpoint's record, with the cameras that were read."""
+    """Return the scene in a checkpoint's record, with the cameras as read."""
     return SceneRecord(**record["scene"] | {"cameras": Cameras(**record["scene"]["cameras"])})
 
 
@@ -117,8 +118,8 @@ def require_training_state(content: Mapping[str, Any], path: Path) -> None:
     """Refuse a checkpoint that training cannot resume from.
 
     Raises:
-        InputError: it holds weights without the state of a training.
-        Mismatch: with the first key of that state that is missing.
+        InputError: it holds weights without training state.
+        Mismatch: names the first missing key of that state.
     """
     if missing := TRAINING.keys() - content.keys():
         raise InputError(
@@ -126,7 +127,7 @@ def require_training_state(content: Mapping[str, Any], path: Path) -> None:
             "save_weights_only=True and nerf prune save it. It can be rendered, evaluated and exported, but not "
             "resumed. Resume another checkpoint of the run, or start a new run from these weights (init_from=FILE)."
         )
-    for key in OF_A_RUN.keys() - content[KEY].keys():  # those that are there have been checked
+    for key in OF_A_RUN.keys() - content[KEY].keys():  # those present have been checked
         raise Mismatch(f"{KEY}.{key}", "is missing")
     if Version(content[LIGHTNING]) < Version("2.0"):
         raise Mismatch(LIGHTNING, "is of a version that this program has never used")

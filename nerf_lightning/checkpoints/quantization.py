@@ -1,7 +1,7 @@
-"""Weights that a checkpoint holds in fewer bytes: tables as smaller numbers, rows left out, switches as bits.
+"""Weights stored in fewer bytes: tables as smaller numbers, rows left out, switches as bits.
 
-What is read back are the tensors that a model loads, in float32. The record is tensors, numbers and words alone, and
-how large it may become in memory is held to a budget before anything is made (`budgets.unpacked_bytes`).
+Reading returns the tensors that a model loads, in float32. The record consists only of tensors, numbers and words, and
+its unpacked size is checked against a budget before anything is allocated (`budgets.unpacked_bytes`).
 """
 
 import math
@@ -22,22 +22,22 @@ SWITCHES = {"bool": torch.bool, "uint8": torch.uint8}
 
 @dataclass(frozen=True)
 class QuantizedRows:
-    """A table in a checkpoint (`nerf prune` writes some)."""
+    """A quantized table in a checkpoint (written by `nerf prune`)."""
 
     shape: list[int]
     starts: list[int]
     """The first row of each of its blocks."""
     kept: UInt8[Tensor, "_"] | None
-    """Which rows are kept, as bits; the others are their block's mean of them. None: all."""
+    """Which rows are kept, as bits; the others are their block's mean. None: all."""
     values: Tensor
-    """Of the kept rows, in units of their block's scale."""
+    """The kept rows, in units of their block's scale."""
     scales: Tensor
     means: Tensor
 
 
 @dataclass(frozen=True)
 class QuantizedSwitches:
-    """A tensor of zeros and ones in a checkpoint, as bits, the first in the lowest of a byte."""
+    """A tensor of zeros and ones in a checkpoint, as bits, the first in the lowest bit of a byte."""
 
     shape: list[int]
     type: Literal["bool", "uint8"]
@@ -46,19 +46,19 @@ class QuantizedSwitches:
 
 @dataclass(frozen=True)
 class Quantized:
-    """All of them, by the names of the weights."""
+    """All quantized tensors, by the names of the weights."""
 
     rows: dict[str, QuantizedRows]
     switches: dict[str, QuantizedSwitches]
 
 
 def from_bits(bits: UInt8[Tensor, "bytes"], count: int) -> Bool[Tensor, "count"]:
-    """Return the first switches that bytes hold."""
+    """Return the first `count` switches from packed bytes."""
     return torch.from_numpy(np.unpackbits(bits.numpy(), count=count, bitorder="little")).bool()
 
 
 def dequantized(quantized: Mapping[str, Any], where: str) -> dict[str, Tensor]:
-    """Return the tensors that quantized weights stand for; whoever loads them compares them with a template.
+    """Return the tensors that quantized weights represent; the caller that loads them compares them with a template.
 
     Args:
         quantized: as `Quantized` describes it.
@@ -66,7 +66,7 @@ def dequantized(quantized: Mapping[str, Any], where: str) -> dict[str, Tensor]:
 
     Raises:
         Mismatch: its parts do not fit each other.
-        InputError: it would take more memory than a person has agreed to.
+        InputError: it would take more memory than the budget allows.
     """
     rows = {name: QuantizedRows(**table) for name, table in quantized["rows"].items()}
     switches = {name: QuantizedSwitches(**each) for name, each in quantized["switches"].items()}
@@ -93,6 +93,6 @@ def _table(table: QuantizedRows, place: str) -> Tensor:
 
 
 def block_of(starts: Sequence[int], count: int) -> Int[Tensor, "rows"]:
-    """Return the number of each row's block, of blocks that begin at `starts`."""
+    """Return the index of each row's block, for blocks that begin at `starts`."""
     sizes = torch.tensor([b - a for a, b in zip(starts, [*starts[1:], count], strict=True)])
     return torch.repeat_interleave(torch.arange(len(starts)), sizes)

@@ -1,9 +1,9 @@
-"""What a checkpoint holds beside weights and optimizer, and how it is read back: the file is enough on its own.
+"""What a checkpoint holds besides weights and optimizer, and how it is read: the file is self-contained.
 
-A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
-Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
-config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learned, where they were),
-quantized (weights in fewer bytes, where it was made smaller), pixels (a hash of each photograph), and the run's state
+A checkpoint consists of tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is
+executed. Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked
+from each config group), scene (cameras, bounds, splits, frame), refined (those cameras as learned, if they were),
+quantized (weights in fewer bytes, if it was made smaller), pixels (a hash of each photograph), and the run's state
 (`training/restore.py`).
 """
 
@@ -44,35 +44,35 @@ class Checkpoint:
 
     path: Path
     config: str
-    """The run's resolved config, yaml text from a stranger."""
+    """The run's resolved config, as untrusted yaml text."""
     choices: dict[str, str]
     scene: SceneRecord
-    """Its cameras are those that training has refined, where it did."""
+    """With the cameras as refined in training, if they were."""
     given_cameras: Cameras | None
-    """As they were before training refined them; None where it did not."""
+    """The cameras before training refined them; None if it did not."""
     weights: dict[str, Tensor]
     """The model's state dict."""
     correction: dict[str, Tensor]
-    """The state dict of the correction."""
+    """The correction's state dict."""
     step: int
     """Optimizer steps of the run."""
     precision: str
     tile_points: int | None
     good: bool
-    """Saved while all was finite, and no step was being left out."""
+    """Saved while everything was finite and no step was being skipped."""
     record: dict[str, Any]
-    """What a checkpoint of this one would keep, beside weights."""
+    """What a checkpoint made from this one would keep, besides weights."""
 
     def load_weights(self, model: nn.Module) -> None:
-        """Put the weights into a model.
+        """Load the weights into a model.
 
         Raises:
-            InputError: with the first tensor that is missing, unknown, of another shape or dtype, or not finite.
+            InputError: names the first tensor that is missing, unknown, of another shape or dtype, or not finite.
         """
         self._load(self.weights, model, "weights")
 
     def load_correction(self, correction: nn.Module) -> None:
-        """Put the correction's weights into one that was fitted to the scene; raises as `load_weights` does."""
+        """Load the weights into a correction that was fitted to the scene; raises as `load_weights` does."""
         self._load(self.correction, correction, "correction")
 
     def _load(self, state: dict[str, Tensor], module: nn.Module, name: str) -> None:
@@ -87,7 +87,7 @@ class Checkpoint:
 
 
 def scene_record(scene: Scene) -> SceneRecord:
-    """Return what outlives the pictures of a scene."""
+    """Return the part of a scene that outlives its pictures."""
     return SceneRecord(**{field.name: getattr(scene, field.name) for field in fields(SceneRecord)})
 
 
@@ -95,7 +95,7 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
     """Return the part of a checkpoint that does not change during a run.
 
     Raises:
-        InputError: the scene is one that no checkpoint could keep, which is better said before training than after.
+        InputError: no checkpoint could keep the scene, which is better reported before training than after.
     """
     record = scene_record(scene)
     try:
@@ -110,11 +110,11 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
 
 
 def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
-    """Read a checkpoint onto the CPU; of a run folder the newest that is whole.
+    """Read a checkpoint onto the CPU; of a run folder, the newest complete one.
 
     Args:
         path: the file, or a run folder.
-        to_resume: keep what was read for the training that is about to ask for it (`content_to_resume`).
+        to_resume: keep the content for the training that is about to request it (`content_to_resume`).
 
     Raises:
         InputError: the file is missing, damaged, not a checkpoint of this program, or of another format.
@@ -129,7 +129,7 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
 
 
 def checkpoint_of(content: dict[str, Any], path: Path) -> Checkpoint:
-    """Return the content of a checkpoint as what it says; `path` is where it lies."""
+    """Return the `Checkpoint` for the content of the file at `path`."""
     record = content[KEY]
     with reading(path, _instead_of(path)):
         state = content["state_dict"] | (dequantized(record["quantized"], str(path)) if "quantized" in record else {})
@@ -155,7 +155,7 @@ def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """Return a checkpoint as it lies in its file, of which everything is as `checkpoints.format` says.
+    """Return the raw content of a checkpoint file, checked against `checkpoints.format`.
 
     Raises:
         InputError: as `read_checkpoint`.
@@ -177,7 +177,7 @@ def _identity(path: Path) -> tuple[int, ...]:
 
 
 def content_to_resume(path: Path) -> dict[str, Any]:
-    """Return a checkpoint as it lies in its file, which is read once: not again where `to_resume` has kept it.
+    """Return the raw content of a checkpoint file, without reading it again if `to_resume` has kept it.
 
     Raises:
         InputError: as `read_checkpoint`.
@@ -187,7 +187,7 @@ def content_to_resume(path: Path) -> dict[str, Any]:
 
 
 def newest_checkpoint(folder: Path, to_resume: bool = False) -> Checkpoint | None:
-    """Read `last.ckpt`, or where it is damaged or missing `previous.ckpt`, and say so; None where nothing was saved.
+    """Read `last.ckpt`, or `previous.ckpt` with a warning if it is damaged or missing; None if nothing was saved.
 
     See `read_checkpoint` for `to_resume`.
 
@@ -221,7 +221,7 @@ def _newest_of_run(folder: Path) -> Checkpoint:
 
 
 def last_good_checkpoint(folder: Path) -> Path | None:
-    """Return the newest of a run's checkpoints that is whole and was saved while all was finite, if there is one."""
+    """Return the newest complete checkpoint of a run that was saved while everything was finite, if there is one."""
     for path in (folder / LAST, folder / PREVIOUS):
         with contextlib.suppress(InputError):
             if read_checkpoint(path).good:
@@ -242,7 +242,7 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _instead_of(path: Path) -> str:
-    """Return the advice to use another checkpoint, by name."""
+    """Return advice that names another checkpoint to use."""
     others = [path.with_name(name) for name in (LAST, PREVIOUS, BEST) if name != path.name]
     names = " or ".join(str(other) for other in others if other.is_file())
     return f"Use another checkpoint of the run ({names})." if names else "The run has no other one: train again."

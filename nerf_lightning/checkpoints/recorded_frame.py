@@ -1,4 +1,4 @@
-"""A scene as the model of a checkpoint knows it: in the frame of its training, with the cameras that it refined."""
+"""A scene as the model of a checkpoint knows it: in the frame of its training, with the refined cameras."""
 
 from dataclasses import replace
 
@@ -11,13 +11,13 @@ from nerf_lightning.nerf.geometry.world_frame import points_from_user, poses_fro
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 SAME_POSE = 1e-3
-"""Of two readings of one capture, in scene units and in the entries of a rotation."""
+"""Tolerance between two readings of one capture, in scene units and in the entries of a rotation."""
 
 
 def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
-    """Return the scene in the frame that a model was trained in, and with its refined cameras where it has some.
+    """Return the scene in the frame that a model was trained in, with its refined cameras if it has any.
 
-    Views that it was not trained on go where the trained ones have gone as a whole.
+    Views that it was not trained on follow the overall motion of the trained ones.
 
     Raises:
         InputError: the model was trained in another kind of space.
@@ -39,7 +39,7 @@ def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
         focal[view] *= refined.cameras.focal[number] / given.focal[number]
         if same_lens:
             lens[view] += refined.cameras.lens[number] - given.lens[number]
-    # A pinhole is a lens that bends nothing, should training have found that others do.
+    # A pinhole is a lens without distortion, in case training learned some for others.
     model = refined.cameras.lens_model if same_lens else scene.cameras.lens_model
     cameras = replace(scene.cameras, c2w=c2w, focal=focal, lens=lens, lens_model=model)
     return replace(scene, cameras=cameras, refined=True)
@@ -48,9 +48,9 @@ def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
 def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:
     """Return the scene with its poses in the frame that a model was trained in.
 
-    The working frame of a capture follows from the views and the sizes that are read, so a scene that is read with
-    other settings (`scene.frames`, `scene.downscale`) has another one, and the model would be looked at from elsewhere.
-    Both frames know their way to the user's.
+    The working frame of a capture follows from the views and the sizes that are read, so a scene read with other
+    settings (`scene.frames`, `scene.downscale`) has another one, and the model would be seen from elsewhere. Both
+    frames know their transform to the user's.
 
     Raises:
         InputError: the model was trained in another kind of space.

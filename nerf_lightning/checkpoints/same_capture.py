@@ -1,4 +1,4 @@
-"""Whether a run goes on with the capture that it has learned from: cameras, names, splits, pixels, depths."""
+"""Check that a run resumes with the capture that it has learned from: cameras, names, splits, pixels, depths."""
 
 import logging
 from collections.abc import Iterable, Mapping
@@ -14,8 +14,8 @@ from nerf_lightning.nerf.geometry.world_frame import poses_from_user, unit_of
 from nerf_lightning.nerf.types.scene import Scene
 
 CLOSE = 1e-5
-"""Two readings of one capture, on machines that round otherwise, differ by less: in the entries of a rotation, and as a
-share of a focal length or of the farthest camera's distance."""
+"""Two readings of one capture, on machines that round differently, differ by less: in the entries of a rotation, and as
+a share of a focal length or of the farthest camera's distance."""
 PIXEL = 1e-3
 DEPTH = 1e-6
 """As a share of a sum over the depths of a photograph."""
@@ -25,10 +25,10 @@ log = logging.getLogger(__name__)
 
 
 def depth_sums(scene: Scene) -> Float[Tensor, "views 4"]:
-    """Return what tells the depths that a view is trained on from others, but for rounding; zeros where it has none.
+    """Return sums that identify the depths that a view is trained on, up to rounding; zeros where it has none.
 
-    Depths are of sparse points or a sensor; what follows from the photographs (`doctor.triangulation`) changes with
-    these, and with the machine. The sums are those of their certainties, alone and times depth, depth * x
+    Depths come from sparse points or a sensor; those computed from the photographs (`doctor.triangulation`) change with
+    these, and with the machine. The sums are of their certainties, alone and times depth, depth * x
     and depth * y, where depths are in the user's units and x and y in pixels.
     """
     sums = torch.zeros(len(scene.view_names), 4, dtype=torch.float64)
@@ -41,15 +41,15 @@ def depth_sums(scene: Scene) -> Float[Tensor, "views 4"]:
 
 
 def require_same_capture(there: Mapping[str, Any], here: Mapping[str, Any], allow_changed: bool) -> None:
-    """Refuse a capture that is not the one of a checkpoint, or warn of it.
+    """Refuse a capture that is not a checkpoint's, or warn about it.
 
     Args:
-        there: the checkpoint's record; without hashes of pixels, or sums of depths, where an earlier version wrote it.
+        there: the checkpoint's record; without hashes of pixels or sums of depths if an earlier version wrote it.
         here: the run's.
-        allow_changed: go on all the same.
+        allow_changed: continue anyway, with a warning.
 
     Raises:
-        InputError: with what has changed.
+        InputError: says what has changed.
     """
     changed = changes(there, here)
     if not changed:
@@ -64,11 +64,11 @@ def require_same_capture(there: Mapping[str, Any], here: Mapping[str, Any], allo
 
 
 def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Return what differs between two records of a capture, in words; photographs are the same by their names."""
+    """Return what differs between two records of a capture, in words; photographs are matched by name."""
     old, new = there["scene"], here["scene"]
     number = {name: view for view, name in enumerate(old["view_names"])}
     both = [(number[name], view) for view, name in enumerate(new["view_names"]) if name in number]
-    # Their numbers in the two, in the order of now.
+    # Their numbers in both records, in the present order.
     a, b = (torch.tensor(views, dtype=torch.int64) for views in (zip(*both, strict=True) if both else ((), ())))
     found = _names(old["view_names"], new["view_names"], in_order=a.tolist() == sorted(a.tolist()))
 
@@ -87,7 +87,7 @@ def changes(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     if "depths" in there and "depths" in here and same_cameras:
         was, now = there["depths"][a], here["depths"][b]
         say("depths (of sparse points or depth maps)", ((was - now).abs() > DEPTH * was.abs()).any(dim=1))
-    # What follows from views and settings goes with them, and is told only where it is all there is to tell.
+    # What follows from views and settings changes with them, and is reported only if nothing else differs.
     return found or _extent(old, new)
 
 
@@ -104,7 +104,7 @@ def _names(old: tuple[str, ...], new: tuple[str, ...], in_order: bool) -> list[s
 def _moved(
     old: Mapping[str, Any], new: Mapping[str, Any], a: Int[Tensor, "views"], b: Int[Tensor, "views"]
 ) -> Bool[Tensor, "views"]:
-    """Return which poses differ in the user's frame; one that does moves the working frame, and all others in it."""
+    """Return which poses differ in the user's frame; a changed pose moves the working frame, and all others in it."""
     was = old["cameras"]["c2w"].double()
     apart = torch.linalg.inv(new["to_user"].double()) @ old["to_user"].double()
     now = poses_from_user(new["cameras"]["c2w"].double(), apart)

@@ -1,6 +1,6 @@
-"""Which classes a stranger's checkpoint may name: parts of models and corrections of ours that follow a contract.
+"""Which classes an untrusted checkpoint may name: our parts of models and corrections that follow a contract.
 
-A person adds modules of their own with `trust=`; no file can.
+The user adds other modules with `trust=`; no file can.
 """
 
 import importlib
@@ -24,15 +24,16 @@ LARGEST_NUMBER = 1 << 53
 
 
 def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None:
-    """Check a model's config from a file, before anything is built of it.
+    """Check a model's config from a file, before anything is built from it.
 
     Args:
         node: the config, or a part of it.
         source: the file, for the message.
-        trusted: modules of the person's own, with all below them, whose parts may be built, too.
+        trusted: the user's modules, including submodules, whose parts may also be built.
 
     Raises:
-        InputError: it names what is no part of a model of ours, or holds what no config of ours does.
+        InputError: it names something that is not a part of this program's models, or holds what none of its configs
+            does.
     """
     for key, value in _settings(node):
         if key == "_target_":
@@ -44,7 +45,7 @@ def require_trusted(node: Any, source: str, trusted: Sequence[str] = ()) -> None
 
 
 def names_of(trusted: Sequence[str]) -> list[str]:
-    """Return the names below which all parts lie that may be built from a file, for Hydra to hold to.
+    """Return the name patterns of all parts that may be built from a file, for Hydra to enforce.
 
     >>> names_of(["my_parts"])[-2:]
     ['nerf_lightning.extensions.*', 'my_parts.*']
@@ -53,7 +54,7 @@ def names_of(trusted: Sequence[str]) -> list[str]:
 
 
 def modules_to_trust(node: Any) -> list[str]:
-    """Return the modules of the parts in a person's own config that are none of this program, each once.
+    """Return the modules of the parts in the user's config that do not belong to this program, each once.
 
     >>> modules_to_trust({"_target_": "my_parts.Model", "field": {"_target_": "nerf_lightning.nerf.fields.x.Field"}})
     ['my_parts']
@@ -63,7 +64,7 @@ def modules_to_trust(node: Any) -> list[str]:
 
 
 def _settings(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each key of a config with its value, sections and lists, too; what is in a list has the list's key."""
+    """Yield each key of a config with its value, including sections and lists; items of a list have the list's key."""
     for name, value in node.items() if isinstance(node, dict) else ((key, each) for each in node):
         yield str(name), value
         if isinstance(value, (dict, list)):

@@ -1,4 +1,4 @@
-"""Checkpoint files that are whole at every moment: a crash leaves the old one or the new one, never half of one."""
+"""Checkpoint files that are complete at every moment: a crash leaves the old one or the new one, never half of one."""
 
 import os
 from pathlib import Path
@@ -12,16 +12,16 @@ from nerf_lightning.messages.errors import InputError
 
 
 def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
-    """Write a whole file and force it to the disk before it takes its name.
+    """Write the whole file and flush it to disk before it takes its name.
 
-    `last.ckpt` becomes `previous.ckpt` before the new one takes its name. Lightning's own way goes through the system's
+    `last.ckpt` becomes `previous.ckpt` before the new one takes its name. Lightning itself writes through the system's
     temporary folder, and a move across file systems is not atomic.
 
     Raises:
-        InputError: the disk is full or the folder cannot be written; the former checkpoint is as it was.
+        InputError: the disk is full or the folder cannot be written; the former checkpoint is unchanged.
     """
     try:
-        target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
+        target.parent.mkdir(exist_ok=True)  # not the run folder: a deleted or renamed one is not recreated
         with whole_file(target) as part:
             with part.open("wb") as file:
                 torch.save(checkpoint, file)
@@ -35,18 +35,18 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
 
 
 def _keep(last: Path, previous: Path) -> None:
-    """Give a checkpoint a second name, so that it has one at every moment; `previous` is replaced."""
+    """Give a checkpoint a second name, so that it always has one; `previous` is replaced."""
     persistently(lambda: previous.unlink(missing_ok=True))
     try:
         os.link(last, previous)
     except OSError:
-        # A file system without links. A crash right now leaves `previous` alone, which readers take then.
+        # A file system without links. A crash right now leaves only `previous`, which readers then use.
         persistently(os.replace, last, previous)
 
 
 def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
     if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
-        error = error.__context__  # torch closes what it could not write, and complains of that
+        error = error.__context__  # torch closes what it could not write, and complains about that
     kept = f"The previous checkpoint {target} is intact. " if target.exists() else ""
     full = isinstance(error, OSError) and error.errno in FULL
     cure = "Free some space" if full else f"Make sure that there is free space and that {target.parent} is writable"
@@ -57,7 +57,7 @@ def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
 
 
 def _sync_folder(folder: Path) -> None:
-    # A rename is safe against a power cut only once the folder is on the disk; Windows cannot open folders.
+    # A rename survives a power cut only once the folder is on disk; Windows cannot open folders.
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""Compile CPU kernels before they are needed, with a bar: half a minute, once on a machine."""
+"""Compile CPU kernels before they are needed, with a progress bar: half a minute, once per machine."""
 
 import logging
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ log = logging.getLogger(__name__)
 
 
 def compile_kernels(modules: Sequence[str]) -> None:
-    """Compile those modules of kernels that numba's cache lacks, on all cores; of several processes the first does.
+    """Compile the modules of kernels that numba's cache lacks, on all cores; of several processes only the first does.
 
     Args:
-        modules: full names; those that take longest first.
+        modules: full names, slowest first.
     """
     ranks.from_first(lambda: _compile(to_compile(modules)))
 

@@ -6,10 +6,10 @@ MOST_THREADS = 4096
 
 
 def num_cores() -> int:
-    """Return how many cores are ours.
+    """Return how many cores this process may use.
 
-    They are those that the process may run on, but no more than Slurm gave its task (`SLURM_CPUS_PER_TASK`) and no more
-    than its share beside other jobs (`OMP_NUM_THREADS`, which parallel sweeps set and people may).
+    These are the cores that it may run on, but no more than Slurm gave its task (`SLURM_CPUS_PER_TASK`) and no more
+    than its share among other jobs (`OMP_NUM_THREADS`, which parallel sweeps set and users may).
     """
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     # OpenMP takes a list, one number per nested level.

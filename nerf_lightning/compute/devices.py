@@ -1,4 +1,4 @@
-"""Which device computes, with the reason, and the process prepared for it."""
+"""Choose the device, with the reason, and prepare the process for it."""
 
 import ctypes
 import logging
@@ -20,14 +20,14 @@ Accelerator = Literal["auto", "cpu", "gpu", "mps", "tpu"]
 DeviceType = Literal["cpu", "cuda", "mps", "xla"]
 LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps", "xla": "tpu"}
 LEAST_GPU_MEMORY = 1_000_000_000
-"""Bytes of a GPU that must be free: tiles shrink to what there is, but libraries and tables need some room."""
+"""Bytes of GPU memory that must be free: tiles shrink to fit, but libraries and tables need some room."""
 
 
 def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
-    """Return the type of device and why it is that one; auto takes a CUDA GPU where there is one, else the CPU.
+    """Return the type of device and the reason; auto chooses a CUDA GPU if there is one, else the CPU.
 
     Raises:
-        InputError: torch does not see the device that was asked for.
+        InputError: torch does not see the requested device.
     """
     if accelerator == "cpu":
         return "cpu", "as asked"
@@ -46,7 +46,7 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
         found = torch.cuda.is_available()
     if found:
         return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
-    # Of a driver that is too old torch warns, and says how old.
+    # torch warns about a driver that is too old, and says how old.
     reason = " ".join(str(told[-1].message).split())[:200].removeprefix("CUDA initialization: ") if told else ""
     if accelerator == "gpu":
         raise InputError(
@@ -59,10 +59,10 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
 
 
 def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> tuple[DeviceType, str]:
-    """Try a chosen GPU, and return it with the reason for it; where it was not asked for, the CPU can take its place.
+    """Try the chosen GPU, and return it with the reason; if it was not requested, the CPU can replace it.
 
     Raises:
-        InputError: the GPU cannot be used, and was asked for, or others of the run have theirs.
+        InputError: the GPU cannot be used, and was requested, or other processes of the run have theirs.
     """
     trouble = _trouble_of_gpu() if chosen[0] == "cuda" else None
     if trouble is None:
@@ -86,7 +86,7 @@ def _trouble_of_gpu() -> str | None:
             return f"{free / 1e9:.1f} GB of its {total / 1e9:.1f} GB of memory are free, and at least 1 GB is needed"
         square = torch.ones(8, 8, device="cuda")
         right = bool((square @ square == 8.0).all())
-    except RuntimeError as error:  # no memory, no kernels for this GPU, a driver that does not fit
+    except RuntimeError as error:  # no memory, no kernels for this GPU, an incompatible driver
         return " ".join(str(error).split())[:200]
     return None if right else "it computes 8 times 1 wrongly"
 
@@ -97,7 +97,7 @@ M_TRIM_THRESHOLD = -1
 
 
 def use_threads(number: int) -> None:
-    """Use as many threads as a run has used before, where there are so many cores."""
+    """Use as many threads as a run has used before, if there are that many cores."""
     cores = os.cpu_count() or 1
     if number <= cores:
         torch.set_num_threads(number)
@@ -112,7 +112,7 @@ def use_threads(number: int) -> None:
 
 
 def prepare_machine(num_threads: int | None) -> None:
-    """Set threads and the allocator, once per process; None: one thread per core."""
+    """Configure threads and the allocator, once per process; None: one thread per core."""
     torch.set_num_threads(num_threads or ALL_THREADS)
     _keep_float32()
     _keep_large_blocks()
@@ -120,14 +120,14 @@ def prepare_machine(num_threads: int | None) -> None:
 
 
 def _keep_float32() -> None:
-    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (matmul_precision.py). cuDNN
-    # would lower convolutions, SSIM's among them, unless it is told not to.
+    # float32 products stay in float32, except where a field lowers its own (matmul_precision.py). By default cuDNN
+    # would lower convolutions, including SSIM's.
     torch.set_float32_matmul_precision("highest")
     torch.backends.cudnn.allow_tf32 = False
 
 
 def _keep_large_blocks() -> None:
-    # glibc gives blocks of 32 MB and more back to the system at each free; fetching them anew costs more than the
+    # glibc returns blocks of 32 MB and more to the system at each free; allocating them again costs more than the
     # arithmetic done in them (measured: 1.5 times the whole step).
     if sys.platform != "linux":
         return
@@ -148,7 +148,7 @@ def _quiet_libraries() -> None:
         {"message": ".*LeafSpec.*", "category": FutureWarning},
         {"message": ".*isinstance.treespec, LeafSpec.*"},
         {"message": ".*ckpt_path.*mid-epoch.*"},
-        {"message": ".*callbacks used to create the checkpoint.*"},  # a budget that a run no longer has
+        {"message": ".*callbacks used to create the checkpoint.*"},  # a budget that the run no longer has
         {"message": "Total length of `list` across ranks is zero"},  # no validation views
         {"message": ".*checkpoint that ended before the epoch ended.*"},
     ]

@@ -1,4 +1,4 @@
-"""What this machine has: memory, with work refused that would not fit, its peak so far, and seconds."""
+"""Measure this machine: memory, refusing work that would not fit, its peak so far, and time."""
 
 import re
 import sys
@@ -14,20 +14,20 @@ import torch
 
 from nerf_lightning.messages.errors import InputError
 
-# Of the memory that is free, so much may be taken.
+# The share of free memory that may be taken.
 SHARE_OF_FREE = 0.8
-# Linux's: where control groups are mounted, and which of them this process is in.
+# On Linux: where control groups are mounted, and which of them this process is in.
 CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-# What a group may take and what it takes (bytes), in versions 2 and 1.
+# A group's limit and usage (bytes), in versions 2 and 1.
 LIMIT_FILES = {2: ("memory.max", "memory.current"), 1: ("memory.limit_in_bytes", "memory.usage_in_bytes")}
-# Files that the system keeps in memory while there is room: a group's own, and in version 1 with those of groups in it.
+# Files that the system caches while there is room: a group's own, and in version 1 those of the groups within it.
 CACHED_FILES = {2: ("inactive_file", "active_file"), 1: ("total_inactive_file", "total_active_file")}
 
 
 def free_memory(device: torch.device | None = None) -> int:
-    """Return how many bytes are free: of a GPU's memory where the device is one, else of the machine's.
+    """Return how many bytes are free: of the GPU's memory if the device is one, else of the machine's.
 
-    A container, or a job of a cluster, has no more than the limits of its control groups leave.
+    In a container or a cluster job, the limits of its control groups apply.
     """
     if device is not None and device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
@@ -36,10 +36,10 @@ def free_memory(device: torch.device | None = None) -> int:
 
 
 def _control_groups() -> Iterator[tuple[Path, int]]:
-    """Yield the groups whose limits hold for this process, each with its version: its own ones and all around them.
+    """Yield the groups whose limits apply to this process, each with its version: its own and all that enclose them.
 
-    A container may be told the path of its group on the host, where its own files lie at the top: what is not there
-    has no limit, and the top is always among those around.
+    A container may see the path that its group has on the host, while its own files are at the top: missing files mean
+    no limit, and the top is always among the enclosing groups.
     """
     try:
         lines = OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -58,7 +58,7 @@ def _control_groups() -> Iterator[tuple[Path, int]]:
 
 
 def _left_to_group(folder: Path, version: int) -> int | None:
-    """Return how many bytes a group may still take, cached files counted as free; None where it has no limit."""
+    """Return how many bytes a group may still take, counting cached files as free; None if it has no limit."""
     try:
         limit, used = (int((folder / name).read_text()) for name in LIMIT_FILES[version])
         counts = dict(re.findall(r"^(\w+) (\d+)$", (folder / "memory.stat").read_text(), re.MULTILINE))
@@ -68,16 +68,16 @@ def _left_to_group(folder: Path, version: int) -> int | None:
 
 
 def require_memory(what: str, size: int, needed: Callable[[int], float], named: Callable[[int], str]) -> None:
-    """Refuse work that takes more memory than can be had; nothing is allocated to find out.
+    """Refuse work that takes more memory than is available, without allocating any.
 
     Args:
-        what: what is asked for, in words that begin a sentence: the setting, and what it makes.
-        size: the whole number that decides how much that takes.
-        needed: returns the bytes that a size takes; no larger size takes less.
+        what: the request, in words that begin a sentence: the setting, and what it makes.
+        size: the whole number that determines how much memory that takes.
+        needed: returns the bytes that a size takes; must not decrease with the size.
         named: returns the setting of a size as the user would write it.
 
     Raises:
-        InputError: it says what is needed, what can be had, and what would fit.
+        InputError: says what is needed, what is available, and what would fit.
     """
     bytes_needed, free = needed(size), SHARE_OF_FREE * free_memory()
     if bytes_needed <= free:
@@ -90,14 +90,14 @@ def require_memory(what: str, size: int, needed: Callable[[int], float], named: 
 
 
 def held_memory(device: torch.device) -> int:
-    """Return how many bytes this process holds now, all libraries included; on a GPU what torch holds of it."""
+    """Return how many bytes this process holds now, all libraries included; on a GPU, what torch holds there."""
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device)
     return int(psutil.Process().memory_info().rss)
 
 
 def peak_memory() -> float:
-    """Return the most memory this process has held so far, in gigabytes; on a GPU the GPU's."""
+    """Return this process's peak memory so far, in gigabytes; with a GPU, the GPU's."""
     if torch.cuda.is_available():
         return torch.cuda.max_memory_allocated() / 1e9
     if sys.platform == "win32":
@@ -110,7 +110,7 @@ def peak_memory() -> float:
 
 
 def seconds_of(work: Callable[[], Any]) -> float:
-    """Do the work, wait until the GPU has done its part, and return how long that took."""
+    """Do the work, wait for the GPU to finish, and return the seconds that took."""
     start = time.perf_counter()
     work()
     if torch.cuda.is_available():
@@ -120,7 +120,7 @@ def seconds_of(work: Callable[[], Any]) -> float:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many threads meanwhile."""
+    """Let torch use `count` threads within the context."""
     former = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -1,4 +1,4 @@
-"""The precision in which a device multiplies by the fields' weights, with the reason for it."""
+"""The precision of a device's products with the fields' weights, with the reason for it."""
 
 import logging
 import os
@@ -19,12 +19,12 @@ NATIVE = "native bfloat16"
 
 
 def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen, str]:
-    """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
+    """Return the precision and the reason; auto is bf16-mixed if the device computes it natively.
 
-    NERF_LIGHTNING_PRECISION in the environment says what auto means: machines of one kind can be tried as another.
+    The environment variable NERF_LIGHTNING_PRECISION overrides what auto means, to try one kind of machine as another.
 
     Raises:
-        InputError: tf32 is asked of a device that has none, or the environment names no precision.
+        InputError: tf32 was requested on a device without it, or the environment names no known precision.
     """
     meant = os.environ.get("NERF_LIGHTNING_PRECISION", "auto")
     if asked == "auto" and meant != "auto":
@@ -50,7 +50,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
 
 
 def suited(precision: Chosen, reason: str, device_type: DeviceType, model: Model) -> tuple[Chosen, str]:
-    """Return what `choose_precision` has chosen, or float32 where that suits the GPU or the model better; and why."""
+    """Return the choice of `choose_precision`, or float32 if that suits the GPU or the model better; and why."""
     if precision == "bf16-mixed" and device_type == "cuda" and not has_native_bfloat16(device_type):
         return "32-true", "bfloat16 products need an NVIDIA GPU from Ampere on, or an AMD GPU"
     wide = any(isinstance(part, Linear) for part in model.modules())

@@ -1,7 +1,7 @@
-"""The processes of a run: which one this is, and what they sum up, exchange and agree on. A single one does all alone.
+"""The processes of a run: which one this is, and what they sum, exchange and agree on. A single one works alone.
 
-`training.launch.processes` joins them; here only torch.distributed is asked whether it has. Each process (rank) works
-on its share of the same global batch, and whatever one of them decides by, all of them know.
+`training.launch.processes` joins them; this module only asks torch.distributed whether it has. Each process (rank)
+works on its share of the same global batch, and all of them know whatever one of them bases a decision on.
 """
 
 import os
@@ -16,7 +16,7 @@ from nerf_lightning.messages.errors import InputError
 
 Item = TypeVar("Item")
 LARGE = 1 << 19
-"""Numbers of a tensor, beyond which it is sent by itself."""
+"""Number of elements above which a tensor is sent by itself."""
 
 
 def world_size() -> int:
@@ -25,17 +25,17 @@ def world_size() -> int:
 
 
 def rank() -> int:
-    """Return which of them this is, from 0."""
+    """Return the index of this process, from 0."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
 def is_first() -> bool:
-    """Return whether this process speaks and writes for all."""
+    """Return whether this process logs and writes for all."""
     return rank() == 0
 
 
 def share(count: int) -> slice:
-    """Return this rank's part of `count` things in a row; the parts are as equal as can be.
+    """Return this rank's part of `count` consecutive items; the parts are as equal as possible.
 
     >>> share(10)
     slice(0, 10, None)
@@ -55,15 +55,15 @@ def part_of(count: int, number: int, parts: int) -> slice:
 
 
 def every_other(items: Sequence[Item]) -> Sequence[Item]:
-    """Return this rank's items where they are dealt out in turn."""
+    """Return this rank's items when they are dealt out in turn."""
     return items[rank() :: world_size()]
 
 
 def add_up(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over the ranks; all ranks get the same bits.
+    """Replace each tensor with its sum over the ranks; all ranks get the same bits.
 
-    Small ones of one type travel in one message, which costs more than their bytes; a copy of a large one would cost
-    more than a message.
+    Small tensors of one dtype share a message, which costs more than their bytes; copying a large one would cost more
+    than a message.
     """
     if world_size() == 1:
         return
@@ -83,19 +83,19 @@ def add_up(tensors: Iterable[Tensor]) -> None:
 
 
 def add_up_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replace the gradients by their sums over the ranks, once a step."""
+    """Replace the gradients with their sums over the ranks, once per step."""
     if world_size() == 1:
         return
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     for parameter in trained:
-        # Every rank must send the same ones; what no ray of this rank has reached has none yet.
+        # Every rank must send the same tensors; parameters that no ray of this rank has reached have no gradient yet.
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
     add_up([parameter.grad for parameter in trained if parameter.grad is not None])
 
 
 def average(tensors: Sequence[Tensor]) -> None:
-    """Replace each tensor by its mean over the ranks."""
+    """Replace each tensor with its mean over the ranks."""
     if world_size() > 1:
         add_up(tensors)
         for tensor in tensors:
@@ -103,7 +103,7 @@ def average(tensors: Sequence[Tensor]) -> None:
 
 
 def total(tensor: Tensor) -> Tensor:
-    """Return the sum of a tensor over the ranks; where there is one, the tensor itself."""
+    """Return the sum of a tensor over the ranks; with one rank, the tensor itself."""
     if world_size() == 1:
         return tensor
     result = tensor.clone()
@@ -121,7 +121,7 @@ def largest(value: float) -> float:
 
 
 def gather(value: Item) -> list[Item]:
-    """Return the values of all ranks, in their order."""
+    """Return the values of all ranks, in rank order."""
     if world_size() == 1:
         return [value]
     values: list[Any] = [None] * world_size()
@@ -130,17 +130,17 @@ def gather(value: Item) -> list[Item]:
 
 
 def in_turn(items: Sequence[Item]) -> list[Item]:
-    """Return all items in their first order, where each rank holds its `every_other`."""
+    """Return all items in their original order, given each rank's `every_other`."""
     parts = gather(list(items))
     rounds = max(map(len, parts))
     return [part[number] for number in range(rounds) for part in parts if number < len(part)]
 
 
 def from_first(make: Callable[[], Item]) -> Item:
-    """Let the first rank make something, and return it on all of them.
+    """Let the first rank make something, and return it on all ranks.
 
     Raises:
-        InputError: what the first rank raised, on all of them.
+        InputError: what the first rank raised, on all ranks.
     """
     if world_size() == 1:
         return make()

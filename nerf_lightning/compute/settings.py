@@ -1,4 +1,4 @@
-"""Device, precision, threads and tile: all that opening and rendering a checkpoint needs of a machine."""
+"""Device, precision, threads and tile: everything about the machine that opening and rendering a checkpoint needs."""
 
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ LEAST_TILE_POINTS = 1 << 10
 
 
 class ComputeSettings:
-    """Where and in which precision to compute. The arguments are those of `TrainerSettings`."""
+    """Where and in which precision to compute. For the arguments see `TrainerSettings`."""
 
     def __init__(
         self,
@@ -42,25 +42,25 @@ class ComputeSettings:
         self._chosen = choose_precision(precision, self.device_type)
         self.precision, self.reason = self._chosen
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
-        # On XLA each size would be compiled first.
+        # XLA would have to compile each size first.
         self.measures_tile = tile_points == "auto" and self.device_type != "xla"
         self.tile_points = default_tile if tile_points == "auto" else tile_points
         self.num_threads, self.devices = num_threads, devices
 
     def prepare_machine(self) -> None:
-        """Set threads and the allocator, once per process."""
+        """Configure threads and the allocator, once per process."""
         prepare_machine(self.num_threads)
         if self.device_type == "xla":
             self.devices = xla_device.use_cores(self.devices)
 
     def take_whole_batches(self) -> None:
-        """Leave tiles out, whatever was asked for: a part looks at all rays of a step."""
+        """Turn tiles off, whatever was requested: a part depends on all rays of a step."""
         self.tile_points, self.measures_tile = None, False
 
     def keep_tile(self, measured: int | None) -> None:
-        """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
+        """Use the tile that a run has measured, unless the user gave one; on a CPU no larger than is ever tried."""
         if self.measures_tile and measured is not None:
-            # The number comes out of a file: ever smaller tiles take hours, ever larger ones the memory.
+            # The number comes from a file: tiny tiles take hours, huge ones all the memory.
             most = MOST_CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
             self.tile_points = min(max(measured, LEAST_TILE_POINTS), most)
 
@@ -73,30 +73,30 @@ class ComputeSettings:
 
     @property
     def inference_tile_points(self) -> int:
-        """Most points at once when rendering without gradients."""
+        """Maximum number of points at once when rendering without gradients."""
         return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
 
     def prepare(self, model: Model) -> Model:
-        """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
+        """Move a model to the device, set its fields' precision to the one that suits both, and return it."""
         self.precision, self.reason = suited(*self._chosen, self.device_type, model)
         set_precision(model, PRODUCTS[self.precision])
         return model.to(self.device)
 
     def describe(self) -> str:
-        """Say device and precision, with the reason where they were chosen."""
+        """Return a description of device and precision, with the reasons for them."""
         count = torch.get_num_threads()
         threads = f", {count} thread{'s' * (count != 1)}" if self.device_type == "cpu" else ""
         processes = f"{ranks.world_size()} processes, each " if ranks.world_size() > 1 else ""
         return f"{processes}{self.device_type}{threads} ({self.device_reason}), {self.precision} ({self.reason})"
 
     def keep_precision(self, former: Any) -> None:
-        """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
+        """Keep the precision that a run began with, unless one was requested: it decides the weights' last bits."""
         if self.reason != "as asked":
             self._chosen = self.precision, self.reason = former, "as when the run started"
 
 
 def cluster_environment() -> ClusterEnvironment:
-    """Return Lightning's view of who started the processes; requeueing on Slurm is ours."""
+    """Return Lightning's view of what started the processes; this program requeues on Slurm itself."""
     if distributed.is_torchelastic_launched():
         return TorchElasticEnvironment()
     return SLURMEnvironment(auto_requeue=False)

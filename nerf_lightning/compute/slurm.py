@@ -1,4 +1,4 @@
-"""What Slurm says about this job, and putting the job back into its queue."""
+"""What Slurm says about this job, and how to requeue it."""
 
 import logging
 import os
@@ -10,13 +10,13 @@ TIMEOUT_SECONDS = 60
 
 
 def slurm_job() -> str | None:
-    """Return the number of the Slurm job that this process belongs to, which stays the same when it is requeued."""
+    """Return the ID of this process's Slurm job, which stays the same when the job is requeued."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
 
 
 def num_tasks() -> int:
-    """Return how many tasks Slurm has given this job or step, 1 outside of Slurm."""
+    """Return how many tasks Slurm has given this job or step; 1 outside Slurm."""
     tasks = os.environ.get("SLURM_NTASKS", "")
     return int(tasks) if tasks.isdecimal() else 1
 

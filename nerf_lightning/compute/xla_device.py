@@ -8,11 +8,11 @@ from lightning.pytorch.accelerators import XLAAccelerator
 from nerf_lightning.messages.errors import InputError
 
 ACCELERATOR: type[XLAAccelerator] = XLAAccelerator
-"""Lightning's, which counts TPU chips; tests put one here that takes XLA's CPU device."""
+"""Lightning's accelerator, which counts TPU chips; tests replace it with one that uses XLA's CPU device."""
 
 
 def require_device() -> str:
-    """Return what kind of device XLA drives here.
+    """Return which kind of device XLA uses here.
 
     Raises:
         InputError: torch_xla is not installed, or finds no TPU.
@@ -32,14 +32,14 @@ def require_device() -> str:
 
 
 def use_cores(wanted: int | Literal["auto"]) -> int:
-    """Prepare this process for so many cores, and return their number; before anything is put on them.
+    """Prepare this process for the cores, and return their number; call before anything is put on them.
 
     Raises:
-        InputError: the machine has another number.
+        InputError: the machine has another number of cores.
     """
     from torch_xla import backends, runtime
 
-    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (matmul_precision.py).
+    # Else a TPU would multiply float32 numbers in bfloat16, even outside fields (matmul_precision.py).
     backends.set_mat_mul_precision("highest")
     if wanted == 1:
         runtime.global_runtime_device_count()  # autograd must see the device before its first backward

@@ -1,8 +1,8 @@
-"""Test cameras of a run that refined its own: each is fitted to its photograph before it is scored.
+"""Test cameras of a run that refined its cameras: each is fitted to its photograph before it is scored.
 
-Where training cameras were wrong and have moved, those of the test views are as wrong and have not. What is scored
-should be the scene, and not the pose file, so each test camera takes some steps on its own photograph with all weights
-frozen (as BARF, arXiv 2104.06405, and Nerfies do); the protocol of the numbers says so.
+Where training cameras were wrong and have moved, those of the test views are just as wrong and have not. The score
+should be of the scene, not of the pose file, so each test camera takes some steps on its own photograph with all
+weights frozen (as BARF, arXiv 2104.06405, and Nerfies do); the protocol of the numbers says so.
 """
 
 from collections.abc import Iterator
@@ -30,10 +30,10 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-4
 @torch.enable_grad()
 @disable_autocast
 def fitted_camera(model: Model, scene: Scene, view: int, background: Background, tile_points: int) -> Cameras:
-    """Return the scene's cameras (refined ones), of which that of `view` has been fitted to its photograph.
+    """Return the scene's (refined) cameras, with that of `view` fitted to its photograph.
 
-    The model is in evaluation mode, and its weights and counts stay as they are; at most `tile_points` points go
-    through a field at once.
+    The model is in evaluation mode, and its weights and counts do not change; at most `tile_points` points go through a
+    field at once.
     """
     device = next(model.parameters()).device
     motion = SE3Delta(weight=0.0)
@@ -69,7 +69,7 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
 
 @contextmanager
 def _frozen(model: Model) -> Iterator[None]:
-    """Let a model learn nothing and count nothing meanwhile."""
+    """Keep a model from learning and counting anything within the context."""
     learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
     counts = [count.clone() for count in sample_counts(model)]
     try:

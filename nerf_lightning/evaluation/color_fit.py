@@ -1,4 +1,4 @@
-"""Renders whose colors are fitted to photographs: what remains is no matter of exposure or white balance."""
+"""Renders whose colors are fitted to photographs: the remaining error is not due to exposure or white balance."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,7 +9,7 @@ from nerf_lightning.nerf.rendering.background import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 from nerf_lightning.nerf.row_chunks import row_chunks
 
-FEWEST = 8  # Pixels from which twelve numbers are not fitted
+FEWEST = 8  # Fewer pixels than this are not fitted
 HALF_A_LEVEL = 0.5 / 255
 
 
@@ -19,9 +19,9 @@ def color_corrected(
     truth: Float[Tensor, "height width 3"],
     kept: Bool[Tensor, "height width"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return A c + b for each color c of a render, with the A (3 x 3) and b of the least squared error.
+    """Return A c + b for each color c of a render, with the A (3 x 3) and b of least squared error.
 
-    The fit of multinerf and gsplat (`cc_psnr`), affine and in encoded colors.
+    This is the fit of multinerf and gsplat (`cc_psnr`): affine, in encoded colors.
 
     Args:
         render: the picture to judge.
@@ -38,7 +38,7 @@ def color_corrected(
     parts = list(row_chunks(*render.shape[:2]))
     sums = (torch.stack([counted(each, rows).sum(dim=0) for rows in parts]).sum(0) for each in (render, truth))
     at, to = (total / count for total in sums)
-    # About the means, and by the pseudoinverse: of a picture of one color nothing but its mean is fitted.
+    # About the means, and by the pseudoinverse: for a picture of one color, only its mean is fitted.
     squares, products = torch.zeros(2, 3, 3, dtype=torch.float64, device=render.device)
     for rows in parts:
         spread = counted(render, rows) - at
@@ -64,17 +64,17 @@ def exposure_fitted(
     fitted: Bool[Tensor, "height width"],
     background: Float[Tensor, "1 3"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return a render under the exposure and white balance that bring some of its pixels closest to its photograph.
+    """Return a render with the exposure and white balance that bring some of its pixels closest to its photograph.
 
-    One gain of linear light per channel, as `correction=exposure` gives a photograph that trains; the background, which
-    no camera saw, keeps its color.
+    One gain on linear light per channel, as `correction=exposure` gives a training photograph; the background, which no
+    camera saw, keeps its color.
 
     Args:
         render: the picture to judge.
         truth: the photograph.
         opacity: of each pixel of the render.
-        fitted: pixels that are compared; where there is none the render stays as it is.
-        background: the color behind the render; None: there is none.
+        fitted: pixels that are compared; if there are none, the render is unchanged.
+        background: the color behind the render; None: no background.
     """
     if not bool(fitted.any()):
         return render

@@ -1,4 +1,4 @@
-"""Measure a model on the views of a split: numbers per picture, what they come to, and the protocol of all of them."""
+"""Measure a model on the views of a split: metrics per picture, their summary, and the protocol of the measurement."""
 
 import logging
 import time
@@ -83,7 +83,7 @@ class Scoring:
         """Render the views, write `metrics.json`, `metrics.csv` and pictures into `folder`, and return the metrics.
 
         Depth errors are in scene units, normal errors in degrees; both only for scenes that know the truth. `origin`
-        says whose numbers these are (`protocol.measured_of`), and is stamped beside them.
+        says what was measured (`protocol.measured_of`), and is recorded with the metrics.
         """
         views = self._views(scene)
         if self.nearest_views is not None and model.baselines is None:
@@ -160,7 +160,7 @@ class Scoring:
 
 
 def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:
-    """Say which views show what no photograph sees, where a model renders from photographs."""
+    """Warn which views show what no photograph sees, if a model renders from photographs."""
     unseen = [(row["unseen"], row["name"]) for row in rows if row.get("unseen")]
     if unseen:
         share, name = max(unseen)
@@ -183,7 +183,7 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
     alpha = (scene.pixels.rgba[part, 3].float() / 255.0).view(shape)
     kept = scene.pixels.kept(view)
     if kept is not None:
-        alpha = alpha * kept  # only what is wholly covered is scored
+        alpha = alpha * kept  # only fully covered pixels are scored
     truth = scene.truth(view)
     far = scene.far[view].expand(shape)
     _, points = picture_surface(RayGenerator(scene.cameras, scene.near, scene.far), view, picture)

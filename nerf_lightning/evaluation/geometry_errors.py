@@ -1,4 +1,4 @@
-"""How close the shape is, for scenes that know theirs: error of the depth and of the normals."""
+"""Errors of depth and normals, for scenes with known geometry."""
 
 import torch
 from jaxtyping import Float
@@ -14,14 +14,14 @@ def depth_error(
     truth_depth: Float[Tensor, "*rays"],
     alpha: Float[Tensor, "*rays"],
 ) -> float | None:
-    """Return the mean absolute error of the depth (scene units) over pixels that the scene covers wholly.
+    """Return the mean absolute error of the depth (scene units) over pixels that the scene fully covers.
 
     Args:
         depth: expected distance along the ray, where light that escapes ends at far.
         opacity: share of the light that was stopped.
-        far: where each ray ends.
+        far: distance at which each ray ends.
         truth_depth: true distance along the ray; inf where there is none.
-        alpha: true coverage of the pixel, in [0, 1]. At an edge there is no one true depth, so only 1 counts.
+        alpha: true coverage of the pixel, in [0, 1]. At an edge there is no single true depth, so only 1 counts.
 
     Returns:
         The error, or None if no pixel can be scored. A hole in the surface counts with depth far.
@@ -39,8 +39,8 @@ def normal_error(
 ) -> float | None:
     """Return the mean angle in degrees between unit normals; None if no pixel can be scored.
 
-    A pixel counts if it and its four neighbors are wholly covered by the scene (`alpha` 1): the differences
-    that make its normal then touch no background. The border, which lacks a neighbor, does not count.
+    A pixel counts if the scene fully covers it and its four neighbors (`alpha` 1): the differences that make its normal
+    then touch no background. The border, which lacks a neighbor, does not count.
     """
     covered, inside = alpha >= 1.0, torch.zeros_like(alpha, dtype=torch.bool)
     above_and_below = covered[:-2, 1:-1] & covered[2:, 1:-1]

@@ -1,4 +1,4 @@
-"""Which of the scored views keep their pictures (some, evenly spaced, and the worst), and which pictures those are."""
+"""Keep the pictures of some scored views, evenly spaced, and of the worst."""
 
 import io
 from collections.abc import Iterable, Iterator
@@ -30,7 +30,7 @@ class ScoredView:
     opacity: Float[Tensor, "height width"]
 
     def parts(self) -> Iterator[tuple[str, UInt8[Tensor, "_ _ 3"]]]:
-        """Yield its pictures with their names, one by one."""
+        """Yield the view's pictures with their names, one by one."""
         return panels(self.truth, self.render, self.depth, self.opacity)
 
 
@@ -42,20 +42,20 @@ class KeptViews:
     split: str
     num_worst: int
     worst: list[tuple[float, str, IO[bytes]]] = field(default_factory=list)
-    """The lowest PSNR so far, with name and pictures; no more are held, since a split may be larger than the disk, and
-    in files without a name, since large ones may be more than memory holds."""
+    """The views of lowest PSNR so far, with name and pictures; no others are held, since a split may be larger than the
+    disk, and these are in unnamed files, since they may exceed memory."""
 
     def save(self, name: str, view: ScoredView) -> None:
-        """Write the pictures of a view of the even spread."""
+        """Write the pictures of an evenly spaced view."""
         self._write(picture_name(self.split, name), view.parts())
 
     def watch(self, name: str, psnr: float, view: ScoredView) -> None:
-        """Hold a view for as long as it may be among the worst."""
+        """Hold a view as long as it may be among the worst."""
         if sum((held[:2] < (psnr, name)) for held in self.worst) >= self.num_worst:
             return
         file = TemporaryFile(dir=make_folder(self.folder))  # noqa: SIM115 (closed where the view is dropped or written)
         for _, picture in view.parts():
-            content = io.BytesIO()  # numpy itself says nothing where the disk is too full for the last bytes
+            content = io.BytesIO()  # numpy does not report a disk too full for the last bytes
             np.save(content, picture.numpy())
             with full_disk_named(self.folder):
                 file.write(content.getbuffer())
@@ -65,7 +65,7 @@ class KeptViews:
         self.worst = self.worst[: self.num_worst]
 
     def finish(self, rows: list[dict[str, Any]]) -> list[str]:
-        """Write those that are among the worst of all processes' rows; return the names of these, the worst first."""
+        """Write the held views that are among the worst of all processes' rows; return the worst names in order."""
         names = [name for _, name in sorted((row["psnr"], row["name"]) for row in rows)][: self.num_worst]
         for _, name, file in self.worst:
             file.seek(0)
@@ -75,12 +75,12 @@ class KeptViews:
         return names
 
     def close(self) -> None:
-        """Let go of what is held."""
+        """Close the held files."""
         for _, _, file in self.worst:
             file.close()
 
     def _write(self, name: str, parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> None:
-        """Write each part (`truth.png`, ...) to a folder, and all in a row to a file."""
+        """Write each part (`truth.png`, ...) to a folder, and all of them side by side to a file."""
         folder = make_folder(self.folder, "images", "views", name)
 
         def saved() -> Iterator[tuple[str, Tensor]]:
@@ -92,7 +92,7 @@ class KeptViews:
 
 
 def picture_name(split: str, view_name: str) -> str:
-    """Return the name of a view's pictures without its ending.
+    """Return the name of a view's pictures, without the file ending.
 
     >>> picture_name("test", "r_0"), picture_name("test", "test/r_0")
     ('test_r_0', 'test_r_0')

@@ -17,7 +17,7 @@ Net = Literal["alex", "vgg"]
 
 _BACKBONES: dict[Net, str] = {"alex": "alexnet", "vgg": "vgg16"}
 _SMALLEST: dict[Net, int] = {"alex": 31, "vgg": 16}
-"""Pixels below which pooling leaves nothing of a side."""
+"""Smallest side in pixels of which pooling leaves anything."""
 
 
 class LPIPS:
@@ -27,7 +27,7 @@ class LPIPS:
         net: the backbone. "alex" is the usual choice for reporting, "vgg" the one many NeRF papers report.
 
     Raises:
-        InputError: torchvision is missing, or its weights are neither in torch's cache nor to be downloaded.
+        InputError: torchvision is missing, or its weights are neither in torch's cache nor available for download.
     """
 
     def __init__(self, net: Net) -> None:
@@ -35,7 +35,7 @@ class LPIPS:
         models = require_extra("torchvision.models", "lpips", f"evaluation.lpips={net}")
         try:
             self._metric = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True)
-        except (OSError, RuntimeError) as error:  # no network; a file that is not what was published
+        except (OSError, RuntimeError) as error:  # no network; a file that differs from the published one
             source = models.get_model_weights(_BACKBONES[net]).DEFAULT.url
             raise InputError(
                 f"evaluation.lpips={net}: the weights of its network could not be loaded ({error}). Without a network, "
@@ -45,7 +45,7 @@ class LPIPS:
 
     @disable_autocast
     def score(self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float | None:
-        """Return the distance of two pictures with colors in [0, 1]: 0 for equal ones, seldom above 1.
+        """Return the distance of two pictures with colors in [0, 1]: 0 for equal ones, rarely above 1.
 
         None for pictures too small for the backbone (31 pixels for alex, 16 for vgg).
         """

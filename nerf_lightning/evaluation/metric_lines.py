@@ -1,4 +1,4 @@
-"""What a person reads of an evaluation, in the console."""
+"""The summary of an evaluation in the console."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ from nerf_lightning.evaluation.protocol import COLORS
 
 
 def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) -> list[str]:
-    """Return the lines that a person reads at the end; a background shows where images have transparency."""
+    """Return the lines printed at the end of an evaluation; the background is named if images have transparency."""
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"

@@ -18,9 +18,9 @@ from nerf_lightning.nerf.row_chunks import row_chunks
 
 SSIM_SIGMA = 1.5
 SSIM_WINDOW = 2 * int(3.5 * SSIM_SIGMA + 0.5) + 1
-"""Pixels across the Gaussian window that torchmetrics chooses for a standard deviation of SSIM_SIGMA pixels: 11."""
+"""Width in pixels of the Gaussian window that torchmetrics uses for a standard deviation of SSIM_SIGMA pixels: 11."""
 HIGHER_IS_BETTER = ("psnr", "cc_psnr", "ssim")
-"""Of the others, which are errors, the lower is better."""
+"""The other metrics are errors: lower is better."""
 
 
 def masked_out(
@@ -28,7 +28,7 @@ def masked_out(
     truth: Float[Tensor, "height width 3"],
     kept: Bool[Tensor, "height width"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return the render with the truth's colors where a pixel is not kept, so that no difference is found there."""
+    """Return the render with the truth's colors where a pixel is not kept, so that there is no difference there."""
     return render if kept is None else torch.where(kept[..., None], render, truth)
 
 
@@ -41,15 +41,15 @@ def image_metrics(
     """Return `psnr` (dB), `cc_psnr` and `ssim` of one image; the render is clamped to [0, 1] first.
 
     `cc_psnr` is the PSNR after an affine fit of the render's colors to the photograph's (`color_fit`), so that neither
-    exposure nor white balance counts. It is None where either is of one color: a fit then says nothing.
+    exposure nor white balance counts. It is None if either has only one color: a fit then says nothing.
 
-    SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
-    is None where the image is smaller than the window: with another window it would be another metric.
+    SSIM is torchmetrics' (Gaussian window, data range 1), which differs from scikit-image's in the third digit. It is
+    None if the image is smaller than the window: with another window it would be another metric.
 
     Args:
         render: the picture to judge.
         truth: the photograph.
-        kept: pixels that count, at least one; None: all. PSNR is that of these pixels. For SSIM, which looks at
+        kept: pixels that count, at least one; None: all. PSNR is over these pixels. For SSIM, which depends on
             neighbors, the others take the photograph's colors.
     """
     render = masked_out(render.clamp(0, 1), truth, kept)
@@ -62,7 +62,7 @@ def image_metrics(
 
 
 def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float:
-    # torchmetrics' mean over all windows, those that reach over the border included, by chunks of their middles.
+    # torchmetrics' mean over all windows, including those that cross the border, in chunks of window centers.
     height, reach, total = render.shape[0], SSIM_WINDOW // 2, 0.0
     for rows in row_chunks(height, render.shape[1]):
         top, bottom = max(0, rows.start - reach), min(height, max(rows.stop + reach, SSIM_WINDOW))
@@ -76,17 +76,17 @@ def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "h
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
-    """Return each metric's mean over images; None where an image has none, since a mean over others misleads."""
+    """Return each metric's mean over images; None if an image lacks it, since a mean over the others would mislead."""
     return {name: None if known is None else sum(known) / len(known) for name, known in _columns(per_image).items()}
 
 
 def median_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
-    """Return each metric's median over images; None where an image has none."""
+    """Return each metric's median over images; None if an image lacks it."""
     return {name: None if known is None else statistics.median(known) for name, known in _columns(per_image).items()}
 
 
 def worst_of_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, int | None]:
-    """Return which image is worst by each metric; None where an image has none.
+    """Return which image is worst by each metric; None if an image lacks it.
 
     >>> worst_of_images([{"psnr": 30.0, "lpips": 0.1}, {"psnr": 20.0, "lpips": 0.3}])
     {'psnr': 1, 'lpips': 1}

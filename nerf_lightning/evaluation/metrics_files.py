@@ -1,4 +1,4 @@
-"""What the rows of all scored views come to, and the files that say it: `metrics.json` and `metrics.csv`."""
+"""The summary of all scored views' rows, and its files: `metrics.json` and `metrics.csv`."""
 
 import csv
 import statistics
@@ -21,8 +21,8 @@ COLUMNS = ("name", *METRICS, "seconds")
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return mean, median and worst of each metric, the speed of rendering, and the rows themselves.
 
-    `frames_per_second` is that of the median picture in one process; `peak_memory_gigabytes` the most that a process
-    has held since it began, on a GPU the GPU's.
+    `frames_per_second` is that of the median picture in one process; `peak_memory_gigabytes` is a process's peak since
+    it started, on a GPU the GPU's.
     """
     values = [{metric: row[metric] for metric in METRICS} for row in rows]
     worst = {
@@ -43,9 +43,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def of_captures(rows: list[dict[str, Any]], capture_of: Mapping[str, str], trained: Collection[str]) -> dict[str, Any]:
-    """Return the means of each capture's views, by its name, and whether it was trained on.
+    """Return, by capture name, the means over its views and whether it was trained on.
 
-    `capture_of` has the capture's name by the view's, `trained` the names of those that were trained on.
+    `capture_of` maps view names to capture names; `trained` holds the names of the trained captures.
     """
     by_name: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
@@ -66,7 +66,7 @@ def write_metrics(folder: Path, result: dict[str, Any]) -> None:
 
 
 def as_text(value: Any) -> str:
-    """Return a value of `metrics.json` as a person reads it: sizes as width x height.
+    """Return a value of `metrics.json` as readable text: sizes as width x height.
 
     >>> as_text([[800, 800], [400, 300]]), as_text("white")
     ('800 x 800, 400 x 300', 'white')

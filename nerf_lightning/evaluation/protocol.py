@@ -1,7 +1,7 @@
-"""How a number was measured, and of what: stamped into every result, so that only equals are compared.
+"""How a number was measured, and of what: recorded in every result, so that only like is compared with like.
 
-`measured_how` is the protocol: two results may stand in one table where theirs agree. `measured_of` names the weights
-and the program; it differs from run to run, and tells where a number came from.
+`measured_how` is the protocol: two results belong in one table if theirs agree. `measured_of` names the weights and the
+program; it differs from run to run, and says where a number came from.
 """
 
 import hashlib
@@ -28,10 +28,10 @@ from nerf_lightning.nerf.types.scene import Background, Scene
 REPOSITORY = Path(__file__).parents[2]
 GIT_SECONDS = 10
 EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras", "colors")
-"""What must agree between results of different scenes, too."""
+"""What must agree even between results of different scenes."""
 MAY_LACK = ("lpips", "cc_psnr")  # What one result may have and another not
 Colors = Literal["raw", "half_fit"]
-"""Whether a render is compared as it is; or on its right half alone, with exposure and white balance of the left."""
+"""Compare a render as it is, or only its right half, with exposure and white balance fitted on the left."""
 COLORS = {"raw": "raw", "half_fit": "exposure and white balance fitted on the left half, scored on the right"}
 
 
@@ -46,8 +46,8 @@ def measured_how(
 ) -> dict[str, Any]:
     """Return the protocol of a measurement.
 
-    A background that is drawn in training means its color at evaluation; `quantize`: the render was rounded to 8 bits;
-    `lpips` is the backbone, None where LPIPS is not computed.
+    A background drawn at random in training stands for its color at evaluation; `quantize`: the render was rounded to 8
+    bits; `lpips` is the backbone, None if LPIPS is not computed.
     """
     sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
     return {
@@ -109,7 +109,7 @@ def measured_of(
 
 
 def config_hash(settings: Any) -> str:
-    """Return a fingerprint of the settings that decide what is learned: equal for runs that differ by their seed alone.
+    """Return a fingerprint of the settings that decide what is learned: equal for runs that differ only in their seed.
 
     >>> config_hash({"seed": 0, "optimizer": {"lr": 1}}) == config_hash({"seed": 1, "optimizer": {"lr": 1}})
     True
@@ -118,7 +118,7 @@ def config_hash(settings: Any) -> str:
 
 
 def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:
-    """Return a fingerprint of names and values, the same wherever and beside whatever else the weights are kept."""
+    """Return a fingerprint of names and values, independent of where and with what else the weights are stored."""
     digest = hashlib.sha256()
     for name in sorted(weights):
         digest.update(name.encode())
@@ -127,7 +127,7 @@ def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:
 
 
 def commit() -> str | None:
-    """Return the commit that this program runs from, `-dirty` where files were changed; None where it is installed."""
+    """Return the commit that this program runs from, with `-dirty` if files were changed; None if it is installed."""
     if not (REPOSITORY / ".git").exists():
         return None
     command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
@@ -139,7 +139,7 @@ def commit() -> str | None:
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bool = True) -> list[str]:
-    """Return what keeps two results from being compared, in words; a metric that one lacks keeps nothing.
+    """Return what keeps two results from being compared, in words; a metric that only one has does not.
 
     >>> differences({"pixels": "float"}, {"pixels": "8-bit"})
     ['pixels: float and 8-bit']
@@ -160,7 +160,7 @@ LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba
 
 
 def environment() -> dict[str, Any]:
-    """Return what machine this is and which versions are installed; a GPU where there is one."""
+    """Return a description of the machine, including a GPU if there is one, and the installed versions."""
     gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     return {
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""Types of what the package offers when it is asked for (`__init__.py`)."""
+"""Types of the names that the package loads lazily (`__init__.py`)."""
 
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder as FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder as HashGridEncoder

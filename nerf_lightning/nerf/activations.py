@@ -1,4 +1,4 @@
-"""From a network's raw numbers to density and color; kernels of whole rays compute the same, with these numbers."""
+"""From a network's raw outputs to density and color; whole-ray kernels compute the same, with these constants."""
 
 from typing import Any
 
@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 LARGEST_RAW = 30.0
-"""Of a raw density: exp is taken of no more."""
+"""Raw densities are clamped to this before exp."""
 LARGEST_SLOPE_RAW = 15.0
-"""Beyond it the slope of the density grows (or, below its negative, falls) no further."""
+"""Beyond it the slope of the density stops growing (or, below its negative, falling)."""
 LEAST_SLOPE = 0.003
-"""Of a color over its raw value, on the way back from black or full: what it is at a color of 0.003 or 0.997. With
-alpha, which teaches density what is empty, there is no need, and Lego loses 0.08 dB by it."""
+"""Minimum slope of a color over its raw value, on the way back from black or full: the slope at a color of 0.003 or
+0.997. With alpha, which teaches the density what is empty, it is not needed, and costs 0.08 dB on Lego."""
 
 
 def density_from(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
@@ -39,11 +39,11 @@ class _TruncatedExponential(torch.autograd.Function):
 
 
 class _Sigmoid(torch.autograd.Function):
-    """1 / (1 + exp(-x)), with a way back from black and from full colors, where it has no slope left.
+    """1 / (1 + exp(-x)), with a way back from black and full colors, where its slope vanishes.
 
-    Where nearly all pixels are black, all colors are within ten steps (1e-38), and what the few pixels of the content
-    ask for would be multiplied by as little. What leads farther out keeps the true slope: as steep, it would carry the
-    weights away to no end, at a cost of 6 dB on photographs with dark corners.
+    If nearly all pixels are black, all colors fall to 1e-38 within ten steps, and the gradients of the few pixels with
+    content would be multiplied by as little. Steps farther out keep the true slope: with the same minimum, they would
+    carry the weights away without end, at a cost of 6 dB on photographs with dark corners.
     """
 
     @staticmethod

@@ -1,9 +1,9 @@
-"""Matrix products, each in a precision that is asked for: nothing around a call changes it.
+"""Matrix products, each in an explicit precision that nothing around a call changes.
 
 torch lowers every float32 product inside `torch.autocast`, and on NVIDIA GPUs wherever TensorFloat-32 is allowed. A
-pose that is multiplied in bfloat16 is wrong by half a percent. So this program opens neither: a field is given the
-precision of the products with its weights (`set_precision`), and every other function that multiplies matrices is
-marked `disable_autocast`, which holds even where somebody else has opened autocast around it.
+pose multiplied in bfloat16 is wrong by half a percent. So this program uses neither: a field is given the precision of
+the products with its weights (`set_precision`), and every other function that multiplies matrices is decorated with
+`disable_autocast`, which holds even inside a caller's autocast.
 """
 
 import functools
@@ -20,15 +20,15 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 TILE_ROWS = 4096
-"""At a width of 64 the activations of a tile take about a core's second-level cache."""
+"""At a width of 64, the activations of a tile take about a core's second-level cache."""
 ROUND_ROWS, FEWEST_ROWS = 512, 64
 AUTOCAST_DEVICES = ("cpu", "cuda", "mps", "xla")
 MatmulPrecision = Literal["float32", "tf32", "bfloat16"]
-"""What the factors of a product are rounded to: not at all, to 10 bits of mantissa, to 7. Sums are float32."""
+"""Rounding of a product's factors: none, to 10 bits of mantissa, to 7 bits. Sums are float32."""
 
 
 def disable_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let a function compute in the precision that its tensors have, inside of somebody's autocast too.
+    """Let a function compute in the precision of its tensors, even inside a caller's autocast.
 
     >>> @disable_autocast
     ... def dot(left, right):
@@ -56,7 +56,7 @@ def linear(
     bias: Float[Tensor, "outputs"] | None,
     matmul_precision: MatmulPrecision,
 ) -> Float[Tensor, "*points outputs"]:
-    """Return features W^T + b: with bfloat16 products in bfloat16, which halves the traffic, else in float32."""
+    """Return features W^T + b: in bfloat16 with bfloat16 products, which halves memory traffic, else in float32."""
     if matmul_precision == "bfloat16":
         if features.is_cpu and not torch.compiler.is_compiling():
             return _LinearInTiles.apply(features, weight, bias)
@@ -70,14 +70,14 @@ def linear(
 
 
 def set_precision(module: nn.Module, matmul_precision: MatmulPrecision) -> None:
-    """Set the precision of the products with the weights within a module; everything else is float32 always."""
+    """Set the precision of the products with the weights within a module; everything else is always float32."""
     for part in module.modules():
         if hasattr(part, "matmul_precision"):
             part.matmul_precision = matmul_precision  # type: ignore[assignment]
 
 
 class Linear(nn.Linear):
-    """torch's linear layer, whose product has a precision of its own."""
+    """torch's linear layer, with its own precision of the product."""
 
     matmul_precision: MatmulPrecision = "float32"
 
@@ -91,7 +91,7 @@ class _LinearInTiles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        # Shapes are undone in here: a view of the result would make a ReLU in place copy its gradients.
+        # Shapes are restored in here: on a view of the result, an in-place ReLU would copy its gradients.
         points, lowered = features.bfloat16().flatten(0, -2), weight.bfloat16()
         added = None if bias is None else bias.bfloat16()
         out = points.new_empty(*features.shape[:-1], weight.shape[0])
@@ -123,7 +123,7 @@ class _LinearInTiles(torch.autograd.Function):
 
 @functools.cache
 def cpu_multiplies_bfloat16() -> bool:
-    """Return whether this CPU, as far as torch may use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 itself."""
+    """Return whether this CPU, as far as torch may use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 natively."""
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     allowed = torch.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
     return allowed and any(map(_cpu_says, probes))
@@ -133,8 +133,8 @@ def cpu_multiplies_bfloat16() -> bool:
 def cpu_gains_by_bfloat16() -> bool:
     """Return whether torch multiplies wide matrices faster in bfloat16 than in float32 on this CPU.
 
-    With AMX it does, and on AMD's. Intel's AVX512-BF16 alone is slower than its float32 (221 for 331 GFLOP/s at 256 x
-    256); kernels of our own, which keep activations in registers, gain there all the same.
+    It does with AMX, and on AMD. Intel's AVX512-BF16 alone is slower than its float32 (221 instead of 331 GFLOP/s at
+    256 x 256); our own kernels, which keep activations in registers, still gain there.
     """
     if not cpu_multiplies_bfloat16():
         return False
@@ -145,14 +145,14 @@ def cpu_gains_by_bfloat16() -> bool:
 def _cpu_says(probe: str) -> bool:
     try:
         return bool(getattr(torch.cpu, probe, bool)())
-    except (RuntimeError, NotImplementedError, OSError):  # a CPU that torch does not know has no such thing
+    except (RuntimeError, NotImplementedError, OSError):  # a CPU unknown to torch has none of these
         return False
 
 
 def multiply(left: Tensor, right: Tensor, added: Tensor | None = None) -> Tensor:
-    """Return left @ right, plus a row; on CPUs that do not multiply bfloat16, of its numbers as float32.
+    """Return left @ right, plus a row; on CPUs without bfloat16 products, of bfloat16 numbers converted to float32.
 
-    That rounds where the others round, and is many times faster than what torch does there.
+    This rounds in the same places, and is many times faster than torch there.
     """
     if left.dtype == torch.bfloat16 and not cpu_multiplies_bfloat16():
         return multiply(left.float(), right.float(), None if added is None else added.float()).bfloat16()
@@ -169,10 +169,10 @@ def tiles_of_rows(rows: int) -> list[slice]:
 
 
 def pad_rows(rows: Float[Tensor, "rows any"], dtype: torch.dtype) -> Float[Tensor, "padded any"]:
-    """Return rows in a dtype; in bfloat16 with rows of zeros behind them, up to one of a dozen sizes.
+    """Return rows in a dtype; in bfloat16, padded with rows of zeros to one of a dozen sizes.
 
-    The CPU's bfloat16 product is compiled anew for every number of rows and kept: 0.7 MB each, and ragged samples come
-    in another number each time. Without this, training held 2 GB more.
+    The CPU's bfloat16 product is compiled for every number of rows and cached, 0.7 MB each, and the number of ragged
+    samples differs each time. Without this, training used 2 GB more.
 
     >>> pad_rows(torch.ones(3, 2), torch.bfloat16).shape, pad_rows(torch.ones(600, 2), torch.bfloat16).shape
     (torch.Size([64, 2]), torch.Size([1024, 2]))
@@ -190,8 +190,8 @@ def pad_rows(rows: Float[Tensor, "rows any"], dtype: torch.dtype) -> Float[Tenso
     return out
 
 
-# TensorFloat-32 is a switch of the whole process, read when a product is made, in the backward pass too. So it is
-# turned inside one operation, which torch.compile does not look into.
+# TensorFloat-32 is a process-wide switch, read at each product, in the backward pass too. So it is set inside a single
+# operation that is opaque to torch.compile.
 @torch.library.custom_op("nerf_lightning::tf32_product", mutates_args=())
 def _tf32_product(left: Tensor, right: Tensor) -> Tensor:
     former = torch.get_float32_matmul_precision()

@@ -1,4 +1,4 @@
-"""What training minimizes: pixels -> rays -> renderings -> what photographs show of them -> named terms of the loss."""
+"""The training objective: pixels -> rays -> renderings -> colors as photographed -> named terms of the loss."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,30 +24,30 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct, concatenate
 
 @dataclass(frozen=True)
 class StepOutput(TensorStruct):
-    """What a step saw of its rays, and what it lost there; detached. Callbacks find it as `outputs["step"]`.
+    """A step's renderings and losses, detached. Callbacks get it as `outputs["step"]`.
 
-    Where steps are recorded and replayed, the next one writes over it: clone what is to be kept.
+    If steps are recorded and replayed, the next one overwrites it: clone what you keep.
     """
 
     losses: Float[Tensor, "levels"]
-    """Of the whole batch, over all processes; their sum was minimized, with the penalties of parts."""
+    """Losses of the whole batch, over all processes; their sum was minimized, plus the penalties of parts."""
     terms: dict[str, Float[Tensor, "levels"]]
-    """The same by term of the loss."""
+    """The losses by term."""
     color_errors: Float[Tensor, "levels"]
-    """Mean squared errors of the levels' colors, over all processes; a level without color has a meaningless one."""
+    """Mean squared errors of the levels' colors, over all processes; meaningless for a level without color."""
     foreground: Float[Tensor, "rays 3"]
     """The last level's light, without the background's; of this process's rays, like all that follows."""
     rgb: Float[Tensor, "rays 3"]
-    """The last level's colors, as they were compared with `target`."""
+    """The last level's colors, as compared with `target`."""
     target: Float[Tensor, "rays 3"]
     weight: Float[Tensor, "rays"]
-    """How much each color counted, on average 1; 0 for masked pixels, and from elsewhere (`Loss.rays_to_render`)."""
+    """Weight of each color, 1 on average; 0 for masked pixels, and for moved rays (`Loss.rays_to_render`)."""
     pixels: PixelIndex
     gradient_norms: dict[str, Float[Tensor, ""]] = field(default_factory=dict)
-    """By level, before clipping; empty where they were not measured or the step was not taken."""
+    """Norms by level, before clipping; empty if they were not measured or the step was not taken."""
 
     def scaled(self, share: float) -> "StepOutput":
-        """Return what a tile of rays, such a share of its batch, adds to the losses and errors of all of it."""
+        """Return the contribution of a tile, `share` of its batch, to the losses and errors of the whole batch."""
         if share >= 1.0:
             return self
         terms = {name: levels * share for name, levels in self.terms.items()}
@@ -55,7 +55,7 @@ class StepOutput(TensorStruct):
 
     @classmethod
     def joined(cls, tiles: Sequence["StepOutput"]) -> "StepOutput":
-        """Return what tiles add up to, their rays one after the other."""
+        """Return the sum of tiles, with their rays concatenated."""
         if len(tiles) == 1:
             return tiles[0]
         return cls(
@@ -71,17 +71,17 @@ class StepOutput(TensorStruct):
 
 
 class Objective(Part):
-    """The loss of pixels, with all that learns in it.
+    """The loss of pixels, with all modules that learn.
 
     Args:
         model: renders rays, level by level.
-        rays: makes the rays through pixels.
+        rays: generates the rays through pixels.
         loss: named terms, each with a number per level; the sum of all is minimized.
-        background: what lies behind the rays.
-        correction: what photographs make of the rendered colors; None leaves them alone.
+        background: what is behind the rays.
+        correction: maps rendered colors to photographed ones; None: the identity.
 
     Raises:
-        InputError: several rays a pixel, and a loss that looks at single rays.
+        InputError: several rays per pixel with a loss that depends on single rays.
     """
 
     correction: Correction | None
@@ -106,18 +106,18 @@ class Objective(Part):
 
     @property
     def together(self) -> int:
-        """How many pixels in a row of a batch no tile and no process may part: those of a square."""
+        """Number of consecutive pixels that no tile or process may separate: those of a patch."""
         return self.loss.patch**2
 
     def forward(
         self, batch: Batch, random: RayRandom | None, weight_scale: Float[Tensor, ""] | float = 1.0
     ) -> StepOutput:
-        """Return what the levels show of a batch's pixels, and what they lose; gradients flow from `losses`.
+        """Return the levels' renderings of a batch's pixels, and their losses; gradients flow from `losses`.
 
         Args:
             batch: pixels of photographs.
-            random: the step's numbers for these pixels; None: samples lie in the middles of their intervals, and the
-                background is that of evaluation.
+            random: the step's random numbers for these pixels; None: samples are in the middle of their intervals, and
+                the background is that of evaluation.
             weight_scale: makes the mean weight of the whole batch, of which this may be a tile, 1.
         """
         background = self._background(batch, random)
@@ -143,16 +143,16 @@ class Objective(Part):
         )
 
     def neutral(self, batch: Batch) -> tuple[list[Rendering], Target]:
-        """Return pixels as evaluation shows them, and their target: no randomness, no photograph's codes or colors."""
+        """Return pixels as evaluation shows them, and their target: without randomness, embeddings and corrections."""
         background = self._background(batch, None)
         return self._render(self._rays(batch.pixels), background, None), self._target(batch, background)
 
     def named_weights(self) -> Iterator[tuple[str, Tensor]]:
-        """Return all parameters by name, those of the model by the names that they have there."""
+        """Yield all parameters by name, those of the model by their names within it."""
         return ((name.removeprefix("model."), weight) for name, weight in self.named_parameters())
 
     def penalties(self) -> Iterator[Float[Tensor, ""]]:
-        """Return what parts add to the loss of a whole step, whatever its pixels are."""
+        """Yield the penalties of parts, which are added to the loss of a whole step, independent of its pixels."""
         return (penalty for part in parts_of(self) if (penalty := part.penalty()) is not None)
 
     def _rays(self, pixels: PixelIndex, photograph: Int[Tensor, "pixels"] | None = None) -> RayBundle:
@@ -186,7 +186,7 @@ class Objective(Part):
 
 
 def _penalties_of_levels(renderings: list[Rendering]) -> dict[str, Float[Tensor, "levels"]]:
-    """Return the penalties of levels as one more term of the loss; no term where no level has one."""
+    """Return the penalties of levels as another term of the loss; no term if no level has one."""
     if all(rendering.penalty is None for rendering in renderings):
         return {}
     none = torch.zeros_like(renderings[0].depth[0])

@@ -1,4 +1,4 @@
-"""The peak signal-to-noise ratio, by which renders are judged; the same wherever one is told."""
+"""The peak signal-to-noise ratio, by which renders are judged; the same everywhere in the program."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -7,13 +7,13 @@ from torch import Tensor
 from nerf_lightning.nerf.row_chunks import row_chunks
 
 LEAST_MSE = 1e-10
-"""Errors below count as this one, a PSNR of 100 dB."""
+"""Smaller errors are clamped to this, a PSNR of 100 dB."""
 
 
 def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
     """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colors in [0, 1]; at most 100.
 
-    Equal pictures (a view of background alone) would have an infinite one, and no mean or file could hold it.
+    Equal pictures (a view of only background) would have an infinite one, which no mean or file could hold.
 
     >>> round(float(psnr(torch.tensor(0.01))), 3)
     20.0
@@ -26,10 +26,10 @@ def picture_psnr(
     truth: Float[Tensor, "height width 3"],
     kept: Bool[Tensor, "height width"] | None = None,
 ) -> float:
-    """Return the PSNR (dB) of a picture, of the pixels that are kept (at least one; None: all)."""
+    """Return the PSNR (dB) of a picture over the kept pixels (at least one; None: all)."""
     total, count = 0.0, 0
     for rows in row_chunks(*render.shape[:2]):
         error = (render[rows] - truth[rows]).square()
         error = error if kept is None else error[kept[rows]]
         total, count = total + float(error.sum(dtype=torch.float64)), count + error.numel()
-    return float(psnr(torch.tensor(total, dtype=torch.float64) / count))  # NaN where none is kept
+    return float(psnr(torch.tensor(total, dtype=torch.float64) / count))  # NaN if none is kept

@@ -1,7 +1,7 @@
-"""Stateless randomness: every number is a hash of what it is for, so nothing depends on what was drawn before.
+"""Stateless randomness: every number is a hash of its purpose, so nothing depends on what was drawn before.
 
 A uniform number is a function of (seed, attempt, step, purpose, ray slot in the global batch, sample number). Tiles,
-ranks and devices slice the same numbers, and a resumed run draws what the uninterrupted one would have drawn.
+ranks and devices slice the same numbers, and a resumed run draws what an uninterrupted one would have drawn.
 Words are non-negative 32-bit integers kept in int64, and each multiplier is below 2^31, so no product overflows
 and every device agrees.
 """
@@ -44,7 +44,7 @@ def purpose_word(purpose: str) -> int:
 
 
 def fold(*parts: int | str) -> int:
-    """Return one 32-bit key for a list of numbers and purposes; the order matters and 0 is a number like others.
+    """Return one 32-bit key for a list of numbers and purposes; the order matters, and 0 is a number like any other.
 
     >>> fold(0, "rays") != fold(1, "rays")
     True
@@ -58,7 +58,7 @@ def fold(*parts: int | str) -> int:
 
 @dataclass(frozen=True)
 class RayRandom(TensorStruct):
-    """The random numbers of a batch of rays in one training step; slice it as the rays are sliced."""
+    """The random numbers of a batch of rays in one training step; slice it like the rays."""
 
     key: Int[Tensor, "*rays"]
     """fold(seed, attempt, step), the same for all rays."""
@@ -88,7 +88,7 @@ class PointRandom(TensorStruct):
     slots: Int[Tensor, "*#points"]
     """The ray's index in the global batch."""
     number: Int[Tensor, "*points"]
-    """Of the sample on its ray."""
+    """Index of the sample on its ray."""
 
     def uniform(self, purpose: str) -> Float[Tensor, "*points"]:
         """Return a number for each point, uniform on [0, 1), in steps of 2^-24."""
@@ -125,11 +125,11 @@ def batch_random(
 
 @with_kernel("random.cpu")
 def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:
-    """Return where a keyed permutation of range(size) sends each index; nothing is stored, any size is allowed.
+    """Return where a keyed permutation of range(size) maps each index; nothing is stored, and any size is allowed.
 
     An alternating Feistel network on a grid of about sqrt(size) x sqrt(size) cells: each round adds a keyed hash of
-    one coordinate to the other. The few cells beyond `size` are walked through until the path comes back (Black and
-    Rogaway, 2002), so the result is a permutation exactly.
+    one coordinate to the other. The few cells beyond `size` are mapped again until the path returns (cycle walking;
+    Black and Rogaway, 2002), so the result is exactly a permutation.
 
     >>> torch.equal(permute(torch.arange(10), 10, torch.full((10,), 7)).sort().values, torch.arange(10))
     True
@@ -160,5 +160,5 @@ def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
 
 def round_words(key: Word) -> list[Word]:
     """Return a word for each round of a permutation."""
-    # As many words as there are keys: a batch that lies in one epoch has one.
+    # As many words as there are keys: a batch within one epoch has one.
     return [mix((key + number * 0x1B873593) & WORD) for number in range(FEISTEL_ROUNDS)]

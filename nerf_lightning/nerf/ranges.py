@@ -1,17 +1,17 @@
-"""The ranges of settings, held where they are taken: a model's may come out of a file, and are not looked at later."""
+"""Check the ranges of settings where they are used: a model's may come from a file, and are not checked later."""
 
 from collections.abc import Mapping
 
 
 def require_ranges(settings: Mapping[str, object], ranges: Mapping[str, tuple[int | float, int | float]]) -> None:
-    """Refuse settings that are out of their ranges; None, which stands for what a class chooses, is in all.
+    """Refuse settings outside their ranges; None, which leaves the choice to the class, is in every range.
 
     Args:
-        settings: by name; others than those with a range may be among them.
-        ranges: least and greatest, by name.
+        settings: values by name; those without a range are ignored.
+        ranges: minimum and maximum by name.
 
     Raises:
-        ValueError: with the first that is out of its range.
+        ValueError: names the first that is outside its range.
     """
     for name, (least, greatest) in ranges.items():
         value = settings[name]

@@ -1,4 +1,4 @@
-"""Chunks of rows: what takes many numbers for each pixel goes over a large picture a few rows at a time."""
+"""Chunks of rows, for work that needs much memory per pixel of a large picture."""
 
 from collections.abc import Iterator
 
@@ -6,7 +6,7 @@ CHUNK_PIXELS = 1 << 18
 
 
 def row_chunks(height: int, width: int) -> Iterator[slice]:
-    """Return the rows of a picture in chunks of about a quarter of a million pixels, from the top.
+    """Yield the rows of a picture in chunks of about a quarter of a million pixels, from the top.
 
     >>> [(rows.start, rows.stop) for rows in row_chunks(5, 100_000)]
     [(0, 2), (2, 4), (4, 5)]

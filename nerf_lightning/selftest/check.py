@@ -1,4 +1,4 @@
-"""A check computes something twice, and says how far the two are apart and how far they may be."""
+"""A check computes something twice, and reports the difference and its bound."""
 
 import logging
 import math
@@ -18,41 +18,41 @@ log = logging.getLogger(__name__)
 
 
 class CannotRun(Exception):
-    """What a check needs is missing; its text says what, and what does the work instead."""
+    """Something that a check needs is missing; the text says what, and what is used instead."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that a machine must compute right."""
+    """Something that a machine must compute correctly."""
 
     name: str
     bound: float
-    """The largest difference that is right."""
+    """The largest acceptable difference."""
     because: str
     """Where the bound comes from."""
     difference: Callable[[], float]
-    """Compute and compare. Raises `CannotRun` if something needed is missing."""
+    """Computes and compares. Raises `CannotRun` if something needed is missing."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What a check found: a row of the table."""
+    """The result of a check: a row of the table."""
 
     name: str
     difference: float | None
     bound: float
     outcome: Literal["ok", "wrong", "not run"]
     note: str
-    """What the bound rests on, what went wrong, or why the check was not run."""
+    """The reason for the bound, what went wrong, or why the check was not run."""
 
 
 def carried_out(check: Check) -> Row:
-    """Do a check and judge it. Whatever it raises counts as wrong, so that the others still run."""
+    """Run a check and judge it. Whatever it raises counts as wrong, so that the others still run."""
     try:
         difference = float(check.difference())
     except CannotRun as reason:
         return Row(check.name, None, check.bound, "not run", str(reason))
-    except Exception as error:  # anything may be broken here, and all of it is an answer
+    except Exception as error:  # anything may be broken here, and any error is a result
         log.debug(check.name, exc_info=True)
         return Row(check.name, None, check.bound, "wrong", " ".join(f"{type(error).__name__}: {error}".split())[:300])
     fits = difference <= check.bound  # nan does not
@@ -60,7 +60,7 @@ def carried_out(check: Check) -> Row:
 
 
 def relative(found: Tensor, expected: Tensor) -> float:
-    """Return the largest difference of two tensors over the largest expected value; nan if one is.
+    """Return the largest difference of two tensors over the largest expected value; NaN if a value is.
 
     >>> relative(Tensor([1.0, 2.5]), Tensor([1.0, 2.0]))
     0.25
@@ -72,26 +72,25 @@ def relative(found: Tensor, expected: Tensor) -> float:
 
 
 def norm_apart(found: Tensor, expected: Tensor) -> float:
-    """Return the norm of a difference over the norm of what is expected; nan if a number is."""
+    """Return the norm of a difference over the norm of the expected value; NaN if a number is."""
     found, expected = found.detach().cpu().double(), expected.detach().cpu().double()
     return float((found - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 def value_bound(matmul_precision: MatmulPrecision, layers: int) -> float:
-    """Return how far rounding moves the output of a perceptron of so many layers, over its norm.
+    """Return how far rounding moves the output of an MLP with `layers` layers, over its norm.
 
-    A layer rounds both factors of its products, and perhaps its result: 3 roundings, where float32 counts the random
-    walk of a sum of 64 terms, 8. Errors of layers are independent, so they add up as sqrt(layers); 4 standard
-    deviations.
+    A layer rounds both factors of its products, and perhaps its result: 3 roundings; for float32, the random walk of a
+    sum of 64 terms: 8. Errors of layers are independent, so they add up as sqrt(layers); 4 standard deviations.
     """
     return 4.0 * layers**0.5 * _of_a_layer(matmul_precision)
 
 
 def gradient_bound(matmul_precision: MatmulPrecision, layers: int) -> float:
-    """Return how far rounding moves the gradient of a perceptron with ReLUs, over its norm.
+    """Return how far rounding moves the gradient of an MLP with ReLUs, over its norm.
 
-    An error e before a ReLU, relative to the spread of what comes there, switches the unit with probability e / pi;
-    half of them are on, so a share 2 e / pi of a layer's signal comes or goes, and squares add up over the layers.
+    An error e before a ReLU, relative to the spread of its inputs, switches the unit with probability e / pi; half of
+    the units are on, so a share 2 e / pi of a layer's signal appears or disappears, and squares add up over the layers.
     """
     return (layers * 2.0 * layers**0.5 * _of_a_layer(matmul_precision) / math.pi) ** 0.5
 
@@ -101,7 +100,7 @@ def _of_a_layer(matmul_precision: MatmulPrecision) -> float:
 
 
 def result_table(rows: list[Row], title: str) -> Table:
-    """Return what was compared, the largest difference, the bound, and the verdict."""
+    """Return a table of what was compared, the largest difference, the bound, and the verdict."""
     table = Table("what", title=title, title_justify="left")
     for name in ("largest difference", "bound", ""):
         table.add_column(name, justify="right" if name else "left")

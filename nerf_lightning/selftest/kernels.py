@@ -26,7 +26,7 @@ from nerf_lightning.selftest.check import UNIT, CannotRun, Check, gradient_bound
 POINTS, RAYS, PACKED_SAMPLES, MLP_SIZES = 2048, 400, 60, (32, 64, 64, 3)
 ROUNDING, LAYERS = UNIT["float32"], len(MLP_SIZES) - 1
 HASH_GRID_SUMS = {"features": 16, "gradient of the table": 64, "gradient of the points": 256}
-"""Results, and the roundings that add up in each."""
+"""Results, and the number of roundings that add up in each."""
 BOUNDS = {"value": value_bound, "gradients": gradient_bound}
 
 
@@ -65,7 +65,7 @@ def _loads(backend: str) -> float:
 
 
 def _largest(differences: list[float]) -> float:
-    return float(torch.tensor(differences).max())  # nan if one is
+    return float(torch.tensor(differences).max())  # NaN if one is
 
 
 def _generator() -> torch.Generator:
@@ -73,7 +73,7 @@ def _generator() -> torch.Generator:
 
 
 def _results(function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> dict[str, list[Tensor]]:
-    """Return the value of a function, and its gradients by its arguments under random weights."""
+    """Return the value of a function, and its gradients with respect to its arguments under random weights."""
     leaves, random = [each.detach().clone().requires_grad_() for each in given], _generator()
     out = function(*leaves)
     torch.autograd.backward(out, [torch.randn(each.shape, generator=random).to(each) for each in out])
@@ -83,19 +83,19 @@ def _results(function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor])
 def _hash_grid(device: torch.device, place: int) -> float:
     """Compare the features (0), the table's gradient (1) or the points' (2)."""
     layout, random = hash_grid_layout(8, 14, 16, 512), _generator()
-    # Whole multiples of 1/4096: their cells and weights are exact in float32, so no point changes its cell.
+    # Multiples of 1/4096: their cells and weights are exact in float32, so no point changes its cell.
     points = torch.randint(-100, 4196, (POINTS, 3), generator=random) / 4096.0
     given = [torch.randn(layout.offsets[-1], 4, generator=random), points]
     found = _results(lambda t, p: [interpolate(t, p, layout)], [each.to(device) for each in given])
     exact = _results(lambda t, p: [interpolate_torch(t, p, layout)], [each.double() for each in given])
     ours, expected = ([*each["value"], *each["gradients"]][place].cpu() for each in (found, exact))
-    # On the cube's faces the derivative by the points has two values.
+    # On the cube's faces, the derivative with respect to the points has two values.
     kept = ((points > 0) & (points < 1)).all(dim=-1) if place == 2 else slice(None)
     return relative(ours[kept], expected[kept])
 
 
 def _march(device: torch.device) -> float:
-    """Return the share of rays whose intervals differ in number, or by more than rounding in their place."""
+    """Return the share of rays whose intervals differ in number, or in position by more than rounding."""
     random, box = _generator(), torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
     eyes = 4.0 * torch.nn.functional.normalize(torch.randn(RAYS, 3, generator=random), dim=-1)
     along = torch.nn.functional.normalize(0.3 * torch.randn(RAYS, 3, generator=random) - eyes, dim=-1)

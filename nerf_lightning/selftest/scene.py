@@ -1,4 +1,4 @@
-"""The scene of the self-test: a ball whose color is its normal, traced on the spot."""
+"""The scene of the self-test: a ball colored by its normals, traced on the fly."""
 
 import torch
 
@@ -13,8 +13,8 @@ TRAIN, HELD_OUT = tuple(range(8)), (8, 9)
 
 
 def ball_scene() -> Scene:
-    """Return ten small views from a circle, with alpha; eight train, two are held out."""
-    angle = 2.4 * torch.arange(NUM_VIEWS)  # the golden angle: every part of the views is spread over the circle
+    """Return ten small views from a circle, with alpha; eight are for training, two are held out."""
+    angle = 2.4 * torch.arange(NUM_VIEWS)  # the golden angle: all parts of the views are spread over the circle
     eyes = 4.0 * torch.stack([angle.cos(), angle.sin(), 0.4 + 0.0 * angle], dim=-1)
     cameras = pinhole_cameras(look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.0, 0.0, 1.0])), FOCAL, SIZE, SIZE)
     near, far = torch.full((NUM_VIEWS,), 2.0), torch.full((NUM_VIEWS,), 6.5)

@@ -1,4 +1,4 @@
-"""A small training of each kind of model, in every precision of the device, against the same on the CPU in float32."""
+"""Small trainings of each kind of model, in every precision of the device, compared with the CPU in float32."""
 
 from collections.abc import Sequence
 from functools import cache, partial
@@ -24,8 +24,8 @@ ENCODER = (
     *("encoder.num_levels=4", "encoder.features_per_level=4", "encoder.log2_table_size=11"),
     *("encoder.min_resolution=4", "encoder.max_resolution=48", "field.width=32"),
 )
-# All samples: where the light is all but gone, rounding decides whether the last one is visible, and however little of
-# it can be seen, Adam scales its gradients up to whole steps (fast_small in bfloat16: 0.36 dB apart instead of 0.005).
+# Keep all samples: where almost no light is left, rounding decides whether the last one is visible, and however little
+# of it is seen, Adam scales its gradients up to full steps (fast_small in bfloat16: 0.36 dB apart instead of 0.005).
 GRID = tuple(
     f"model.levels.fine.sampler.{each}"
     for each in ("resolution=16", "num_steps=48", "update_every=8", "warmup_steps=16", "opaque_below=0.0")
@@ -36,19 +36,20 @@ METHODS = {
     "fast_dense": (*ENCODER, *GRID),
     "fast_proposal": ENCODER,
 }
-"""The settings that make models of conf/model small."""
+"""Settings that make the models of conf/model small."""
 LAYERS = 6
-"""Products of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
+"""Maximum number of consecutive matrix products in a forward pass, over which rounding adds up."""
 # Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
-# 0.5 to 0.75 dB. What rounding does to a run must be less than that where products have 8 or 11 bits (of five runs of
-# fast_dense whose factors were rounded to 11 at random, one was 0.21 dB off), and a tenth where only the order differs.
+# 0.5 to 0.75 dB. The effect of rounding on a run must be smaller if products have 8 or 11 bits (of five runs of
+# fast_dense with factors rounded to 11 bits at random, one was 0.21 dB off), and a tenth of that if only the order
+# differs.
 PSNR_APART: dict[MatmulPrecision, float] = {"float32": 0.05, "tf32": 0.5, "bfloat16": 0.5}
-LEARNT = 1e4  # Tables begin between -1e-4 and 1e-4, and learn to be about 1
+LEARNT = 1e4  # Tables start between -1e-4 and 1e-4, and grow to about 1
 CPU = torch.device("cpu")
 
 
 class Training:
-    """A training in the making."""
+    """A training that is set up."""
 
     def __init__(self, method: str, device: torch.device, matmul_precision: MatmulPrecision, tile_points: int | None):
         scene, progress = ball_scene(), Progress()
@@ -63,8 +64,8 @@ class Training:
         self.optimizer = self.train_step.new_optimizer()
 
     def gradients(self) -> dict[str, Tensor]:
-        """Return the gradients of the first batch, with tables as large as trained ones are."""
-        # Fresh ones are all but zero: whatever is done with them would hardly matter.
+        """Return the gradients of the first batch, with tables scaled like trained ones."""
+        # New tables are almost zero: what is done with them would hardly matter.
         with torch.no_grad():
             for table in tables_of(self.train_step.objective.model):
                 table.mul_(LEARNT)
@@ -111,20 +112,20 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
 
 @cache
 def reference_gradients(method: str) -> dict[str, Tensor]:
-    """Return the gradients of the first batch, by plain torch on the CPU, in float32, without tiles."""
+    """Return the gradients of the first batch in plain torch on the CPU, in float32, without tiles."""
     with without(*CPU_BACKENDS):
         return Training(method, CPU, "float32", None).gradients()
 
 
 @cache
 def reference_psnr(method: str) -> float:
-    """Return the PSNR of a training by the same."""
+    """Return the PSNR of a training by the same means."""
     with without(*CPU_BACKENDS):
         return Training(method, CPU, "float32", None).psnr()
 
 
 def gradients_apart(found: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
-    """Return how far the gradients of a model are apart, all in one, over the norm of what is expected."""
+    """Return the norm of the difference of all of a model's gradients, over the norm of the expected ones."""
     if found.keys() != expected.keys():
         raise ValueError(f"gradients of {sorted(found.keys() ^ expected.keys())} are there in one and not in the other")
     ours, theirs = (torch.cat([each[name].cpu().flatten() for name in expected]) for each in (found, expected))

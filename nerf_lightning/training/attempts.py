@@ -1,4 +1,4 @@
-"""Attempts of a run: their weights are drawn from seed and number, and a guard begins another where one fails."""
+"""Attempts of a run: their weights are drawn from seed and number, and a guard starts another if one fails."""
 
 import torch
 from torch.optim import Optimizer
@@ -10,7 +10,7 @@ from nerf_lightning.training.step import TrainStep
 
 
 def draw_weights(train_step: TrainStep) -> None:
-    """Draw the weights of this attempt, or take those that it starts from."""
+    """Draw the weights of this attempt, or load those that it starts from."""
     objective = train_step.objective
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(fold(train_step.seed, train_step.progress.attempt, "weights"))
@@ -21,7 +21,7 @@ def draw_weights(train_step: TrainStep) -> None:
 
 
 def restart(train_step: TrainStep, optimizer: Optimizer) -> None:
-    """Begin a new attempt with fresh weights, optimizer and order of rays."""
+    """Begin a new attempt with new weights, optimizer state and order of rays."""
     train_step.progress.restart()
     draw_weights(train_step)
     optimizer.state.clear()
@@ -31,9 +31,9 @@ def count_rollback(train_step: TrainStep, former: Progress, skipped: int) -> Non
     """Begin a new attempt, with other random numbers, from the state that was just restored.
 
     Args:
-        train_step: of the run.
-        former: where the run stood before.
-        skipped: steps that were left out before.
+        train_step: the run's training step.
+        former: the run's progress before.
+        skipped: number of steps skipped before.
     """
     progress = train_step.progress
     progress.attempt, progress.rollbacks = former.attempt + 1, former.rollbacks + 1
@@ -42,6 +42,6 @@ def count_rollback(train_step: TrainStep, former: Progress, skipped: int) -> Non
 
 
 def _forget_recordings(train_step: TrainStep) -> None:
-    """Free the memory of all recordings; a further step makes new ones, of where everything lies then."""
+    """Free the memory of all recordings; the next step makes new ones with the new addresses."""
     if isinstance(train_step.gradients, RecordedGradients):
         train_step.gradients.recordings.clear()

@@ -1,4 +1,4 @@
-"""The step of training, built from a config: model, cameras, loss, correction, optimizer and schedule."""
+"""Build the training step from a config: model, cameras, loss, correction, optimizer and schedule."""
 
 from dataclasses import replace
 
@@ -36,20 +36,20 @@ def build_step(
     model: Model | None = None,
     loss: Loss | None = None,
 ) -> TrainStep:
-    """Build model, cameras, loss, correction, optimizer and schedule into the step of training.
+    """Return the training step, built of model, cameras, loss, correction, optimizer and schedule.
 
     Args:
-        config: of the run.
-        settings: of the machine.
-        scene: what is learned.
-        progress: the run's place.
-        start: the checkpoint whose weights it begins with.
-        model: one in the place of the config's.
-        loss: the same.
+        config: the run's config.
+        settings: the trainer's settings.
+        scene: the scene to learn.
+        progress: the run's progress.
+        start: the checkpoint whose weights the run begins with.
+        model: replaces the config's.
+        loss: replaces the config's.
 
     Raises:
-        InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
-            correction for one photograph, several processes for a part that looks at all rays of a step.
+        InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be tiled, a
+            correction for one photograph, several processes for a part that depends on all rays of a step.
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
@@ -65,7 +65,7 @@ def build_step(
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
-        optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
+        optimizer.keywords.pop("fused", None)  # torch's fused optimizers are for other devices; XLA fuses by itself
     if settings.deterministic:
         require_deterministic(model, settings.device_type)
     hold_to_budgets(model, "The model")

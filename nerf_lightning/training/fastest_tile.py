@@ -1,4 +1,4 @@
-"""Choose the tile by a short measurement: how many points at a time suit this machine's caches and this model."""
+"""Choose the tile by a short measurement: the number of points that suits this machine's caches and this model."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -13,14 +13,14 @@ from nerf_lightning.training.step import TrainStep
 
 CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
 GPU_TILES = (1 << 18, 1 << 20, 1 << 22)
-# Points of a tile whose rays kernels take one after the other through their caches: it bounds memory alone.
+# Points per tile if kernels process whole rays in the caches: it only bounds memory.
 WHOLE_RAYS_TILE = 262_144
-# A tile must be better by so much to be preferred to a smaller one, which takes less memory.
+# A tile must be faster by this factor to be preferred to a smaller one, which takes less memory.
 GAIN = 0.95
-# Smaller tiles than one that takes so much longer than the fastest are not tried: they only add to what made it slow.
+# If a tile is this much slower than the fastest, smaller ones are not tried: they only add to what made it slow.
 HOPELESS = 1.2
 LONGEST_SECONDS = 0.4
-# What the trial takes, in steps and at most: so short a run would spend more on it than it saves.
+# Maximum cost of the trial in steps: shorter runs would spend more on it than it saves.
 SHORT_RUN = 50
 FEW_RAYS = 16
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 def measured_tile(settings: TrainerSettings, train_step: TrainStep, batches: RayBatches) -> tuple[int, float | None]:
     """Return the best of a few tile sizes, and about how many seconds a step takes with it.
 
-    By training steps that are thrown away; a few seconds at most. None: the tile is known without.
+    Runs training steps that are discarded, for a few seconds at most. None: the tile is known without measuring.
     """
     train_step.objective.to(settings.device)
     model, learns_cameras = train_step.objective.model, train_step.objective.rays.learns_cameras
@@ -41,7 +41,7 @@ def measured_tile(settings: TrainerSettings, train_step: TrainStep, batches: Ray
     points = num_rays * model.points_per_ray(training=True)
     tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES
     enough = next((number for number, tile in enumerate(tiles) if tile >= points), len(tiles))
-    # Larger ones than the first that takes all points at once would be the same.
+    # Tiles larger than the first that takes all points at once would be the same.
     best, seconds = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, train_step, batch, num_rays, tile))
     train_step.objective.zero_grad(set_to_none=True)
     reset_statistics(train_step.objective)
@@ -50,10 +50,10 @@ def measured_tile(settings: TrainerSettings, train_step: TrainStep, batches: Ray
 
 
 def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> tuple[int, float]:
-    """Return the tile that takes the shortest time of two tries, or a smaller one that takes hardly longer; its time.
+    """Return the fastest tile (the better of two tries), or a smaller one that takes hardly longer; and its time.
 
-    Large tiles are tried first: small ones take the longest to measure, and are the best only where large ones do not
-    fit into the caches.
+    Large tiles are tried first: small ones take longest to measure, and are best only if large ones do not fit into the
+    caches.
 
     >>> fastest((4, 8, 16), {4: 9.0, 8: 3.0, 16: 2.9}.__getitem__)
     (8, 3.0)
@@ -72,8 +72,9 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> tuple[int,
 
 def _rays_in_time(settings: TrainerSettings, train_step: TrainStep, batch: Batch) -> int:
     _seconds(settings, train_step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
-    average_counts(train_step.objective.model)  # how many samples rays have is known from here on
-    # Grown, not extrapolated: a tile of few rays says little of one of many, and too few rays make all tiles alike.
+    average_counts(train_step.objective.model)  # the number of samples per ray is known from here on
+    # Grown, not extrapolated: a tile of few rays says little about one of many, and with too few rays all tiles are
+    # alike.
     rays = min(batch.num_rays, 4 * FEW_RAYS)
     seconds = _seconds(settings, train_step, batch, rays, CPU_TILES[0])
     while rays < batch.num_rays and 4.0 * seconds <= LONGEST_SECONDS:

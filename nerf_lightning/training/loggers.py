@@ -1,4 +1,4 @@
-"""Where curves and pictures go beside TensorBoard: Lightning's own loggers, each opened in a run's folder."""
+"""Where curves and pictures go besides TensorBoard: Lightning's own loggers, each opened in a run's folder."""
 
 import importlib.util
 import os
@@ -27,8 +27,8 @@ class RunLogger(ABC):
         """Return the logger of the run in this folder.
 
         Args:
-            folder: of the run.
-            started: when it did; the same for each start of a run that is gone on with.
+            folder: the run folder.
+            started: when the run started; the same for each start of a resumed run.
 
         Raises:
             InputError: it cannot be opened.
@@ -36,16 +36,16 @@ class RunLogger(ABC):
 
 
 class CsvFiles(RunLogger):
-    """Every curve in `csv/version_N/metrics.csv` of the run folder, a version for each start; it takes no pictures."""
+    """Every curve in `csv/version_N/metrics.csv` of the run folder, one version per start; it takes no pictures."""
 
     def open(self, folder: Path, started: str) -> CSVLogger:
         """See `RunLogger`."""
-        # Lightning's would empty the folder of an earlier start, if it had one name for all of them.
+        # With one name for all starts, Lightning's logger would empty the folder of an earlier one.
         return CSVLogger(save_dir=folder, name="csv", flush_logs_every_n_steps=1)
 
 
 class WeightsAndBiases(RunLogger):
-    """Curves, settings and pictures in a project of Weights & Biases; a resumed run goes on in its page there.
+    """Curves, settings and pictures in a project of Weights & Biases; a resumed run continues on its page there.
 
     Args:
         project: the project of the run; it is created if it is missing.
@@ -62,10 +62,10 @@ class WeightsAndBiases(RunLogger):
         self.project, self.entity, self.offline = project, entity, offline
 
     def require_access(self) -> None:
-        """Look for a key before the run has a folder; in a terminal, W&B asks for one.
+        """Look for an API key before the run has a folder; in a terminal, W&B asks for one.
 
         Raises:
-            InputError: nobody is logged in.
+            InputError: the user is not logged in.
         """
         if self.offline or os.environ.get("WANDB_MODE") in ("offline", "dryrun", "disabled"):
             return
@@ -93,7 +93,7 @@ class WeightsAndBiases(RunLogger):
 
 
 class MLflow(RunLogger):
-    """Curves, settings and pictures in an experiment of MLflow; each start of a run is a run of its own there.
+    """Curves, settings and pictures in an experiment of MLflow; each start of a run is a separate run there.
 
     Args:
         experiment: the experiment of the run; it is created if it is missing.
@@ -123,13 +123,13 @@ class MLflow(RunLogger):
 
 @contextmanager
 def opened_loggers(chosen: Mapping[str, Any], folder: Path, started: str, **purge: int) -> Iterator[list[Logger]]:
-    """Open what the config chose, and close it when the run ends, however it does.
+    """Open the config's loggers, and close them when the run ends, for whatever reason.
 
     Args:
-        chosen: built from the config: of this file, or Lightning's own that lack only `save_dir`.
-        folder: of the run.
-        started: when it did.
-        **purge: `purge_step`, from which TensorBoard forgets what an earlier start has logged.
+        chosen: loggers built from the config: classes of this file, or Lightning's own that lack only `save_dir`.
+        folder: the run folder.
+        started: when the run started.
+        **purge: `purge_step`, from which TensorBoard discards what an earlier start has logged.
 
     Raises:
         InputError: one cannot be opened.
@@ -148,11 +148,11 @@ def opened_loggers(chosen: Mapping[str, Any], folder: Path, started: str, **purg
     finally:
         for logger in loggers:
             if isinstance(logger, WandbLogger):
-                logger.experiment.finish(exit_code=code)  # else the next job of a sweep would go on with it
+                logger.experiment.finish(exit_code=code)  # else the next job of a sweep would continue it
 
 
 def show_picture(loggers: list[Logger], tag: str, picture: UInt8[Tensor, "height width 3"], step: int) -> None:
-    """Give a picture to those loggers that take some: TensorBoard, Weights & Biases, MLflow."""
+    """Log a picture with the loggers that support pictures: TensorBoard, Weights & Biases, MLflow."""
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
             logger.experiment.add_image(shown_name(tag), picture.numpy(), step, dataformats="HWC")

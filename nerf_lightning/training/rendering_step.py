@@ -1,4 +1,4 @@
-"""A step for a checkpoint whose training is over: it renders and validates, and takes no step."""
+"""A training step for a finished checkpoint, which renders and validates but does not train."""
 
 from collections.abc import Sequence
 from typing import NoReturn
@@ -16,9 +16,9 @@ from nerf_lightning.training.step import TrainStep
 
 
 def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> TrainStep:
-    """Return a step that renders and validates, and takes no step.
+    """Return a training step that renders and validates but does not train.
 
-    The loss, the optimizer and the schedule of a run come from its person's own config alone, never from a file.
+    A run's loss, optimizer and schedule come only from the user's own config, never from a file.
     """
 
     def no_optimizer(parameters: object) -> NoReturn:

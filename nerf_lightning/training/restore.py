@@ -1,4 +1,4 @@
-"""What a checkpoint keeps of a run, what a resume restores of it, and what it is held against first.
+"""What a checkpoint keeps of a run, what a resume restores, and what is checked first.
 
 Lightning restores weights, optimizer, callbacks and loops; `restore_run` restores the rest.
 """
@@ -25,16 +25,16 @@ CURE = (
     "new run from its weights alone (init_from=FILE)."
 )
 SIDES = (5, 7, 11, 13, 17)
-"""Of the parameter that shows what an optimizer keeps: no two alike, so that each side is known again."""
+"""Sides of the parameter that probes what an optimizer keeps: all different, so that each can be identified."""
 RATES = ("lr", "base_lr")
-"""Of a group of parameters: what the schedule sets anew."""
+"""Entries of a parameter group that the schedule sets."""
 WAYS = ("fused", "foreach", "capturable")
-"""How the same update is computed, which depends on the device."""
+"""Settings of how the same update is computed, which depend on the device."""
 Build = Callable[[Iterable[Any]], Optimizer]
 
 
 def run_state(train_step: TrainStep) -> dict[str, Any]:
-    """Return what a checkpoint keeps of a run beside its record, weights and optimizer."""
+    """Return what a checkpoint keeps of a run besides its record, weights and optimizer."""
     return {
         "progress": asdict(train_step.progress),
         "bad_steps": train_step.guard.state(),
@@ -45,7 +45,7 @@ def run_state(train_step: TrainStep) -> dict[str, Any]:
 
 
 def loops_after(steps: int) -> dict[str, Any]:
-    """Return what Lightning's loops keep in the midst of a run's one epoch, after so many steps."""
+    """Return the state of Lightning's loops within a run's single epoch, after `steps` steps."""
     no_trainer: Any = None
     fit: Any = _FitLoop(no_trainer)
     epoch, optimizer_steps = fit.epoch_loop, fit.epoch_loop.manual_optimization.optim_step_progress
@@ -57,13 +57,13 @@ def loops_after(steps: int) -> dict[str, Any]:
     for taken in (optimizer_steps.total, optimizer_steps.current):
         taken.ready = taken.completed = steps
     state = fit.state_dict()
-    state["epoch_loop.state_dict"]["_batches_that_stepped"] = steps  # what Lightning numbers its own log by
+    state["epoch_loop.state_dict"]["_batches_that_stepped"] = steps  # the step count of Lightning's own log
     states = state, evaluation, evaluation, _PredictionLoop(no_trainer).state_dict()
     return dict(zip(LOOPS, states, strict=True))
 
 
 def restore_run(state: Mapping[str, Any], train_step: TrainStep, device: torch.device) -> None:
-    """Take a run up where `run_state` left it; a sum's last bits depend on the number of threads."""
+    """Restore a run from its `run_state`; a sum's last bits depend on the number of threads."""
     train_step.progress.take_up(Progress(**state["progress"]))
     train_step.guard.restore(state["bad_steps"], device)
     if state["world_size"] == ranks.world_size():
@@ -81,27 +81,27 @@ def require_resumable(
     progress: Progress,
     together: int,
 ) -> None:
-    """Refuse a checkpoint that is sound in itself, and not of this run.
+    """Refuse a checkpoint that is valid in itself but does not belong to this run.
 
     Args:
-        content: as `read_content` returned it.
+        content: the result of `read_content`.
         path: the file, for messages.
-        weights: the run's own, and what else it learns, by name.
-        optimizer: newly made, over the run's parameters.
-        build: makes an optimizer of this kind.
-        callbacks: the run's. One that has annotated its state (`STATE`) takes nothing else; what is part of the
-            computation (`needs_state`) has to be there.
-        loops: what the trainer's loops keep.
-        progress: the run's, as the loader has set it up.
-        together: pixels in a row of a batch that are not parted.
+        weights: the run's weights, and all else that it learns, by name.
+        optimizer: a new optimizer of the run's parameters.
+        build: builds an optimizer of this kind.
+        callbacks: the run's callbacks. One that annotates its state (`STATE`) accepts nothing else; the state of those
+            that are part of the computation (`needs_state`) must be present.
+        loops: the state of the trainer's loops.
+        progress: the run's progress, as set up by the loader.
+        together: number of consecutive pixels of a batch that are not separated.
 
     Raises:
-        InputError: with the place in the checkpoint.
+        InputError: names the place in the checkpoint.
     """
     with reading(path, CURE):
         require_training_state(content, path)
         require_fit(content["state_dict"], weights, "state_dict")
-        for name, switch in weights.items():  # which kind of space this is, and with it the shapes of others
+        for name, switch in weights.items():  # the kind of space, and with it the shapes of others
             if switch.dtype == torch.bool and not switch.dim() and bool(switch) != bool(content["state_dict"][name]):
                 raise Mismatch(f"state_dict.{name}", f"is not {bool(switch)}, as the run's scene and settings are")
         (state,) = content["optimizer_states"]
@@ -116,7 +116,7 @@ def require_resumable(
         steps = content["loops"]["fit_loop"]["epoch_loop.manual_optimization.optim_step_progress"]["total"]
         if set(steps.values()) != {content["global_step"]}:
             raise Mismatch("loops.fit_loop", f"has not taken the {content['global_step']} steps of the checkpoint")
-        # Batches are allocated by these two.
+        # These two determine the size of batches.
         found, largest = Progress(**content[KEY]["progress"]), progress.largest_batch
         if found.largest_batch != largest or found.batch_rays not in batch_sizes(largest, together):
             raise Mismatch("progress", f"has {found.batch_rays} rays of {found.largest_batch}, not those of the run")
@@ -130,7 +130,7 @@ def _require_optimizer(state: Any, optimizer: Optimizer, build: Build) -> None:
         for key in group.keys() & {*RATES, *WAYS}:
             require_fit(group[key], float if key in RATES else bool | None, f"optimizer_states.{key}")
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    if state["state"]:  # one that has taken no step keeps nothing
+    if state["state"]:  # before its first step, an optimizer keeps nothing
         template = dict(enumerate(_kept_of(parameter, build) for parameter in parameters))
         require_fit(state["state"], template, "optimizer_states")
 
@@ -140,7 +140,7 @@ def _settings(group: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _kept_of(parameter: Tensor, build: Build) -> dict[str, Any]:
-    """Return what this kind of optimizer keeps of a parameter, on meta, by taking a step of a small one."""
+    """Return what this kind of optimizer keeps of a parameter, on meta, by taking a step with a small one."""
     small = nn.Parameter(torch.zeros(SIDES[: parameter.dim()]))
     small.grad = torch.zeros_like(small)
     optimizer = build([small])

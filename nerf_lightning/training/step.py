@@ -1,4 +1,4 @@
-"""One step of training, which needs torch and no trainer: the gradients of named loss terms change the weights."""
+"""One training step, which needs torch and no trainer: the gradients of named loss terms change the weights."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,29 +26,30 @@ from nerf_lightning.training.gradients.recorded import RecordedGradients
 from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard
 
-# The number of rays per step changes no more often.
+# The number of rays per step changes at most every this many steps.
 BATCH_STEPS = 16
 
 
 class TrainStep:
-    """Take steps of training, one after the other.
+    """Take training steps, one after another.
 
-    Where a run has several processes, each has its share of the batch, and their gradients are added up once a step.
+    If a run has several processes, each has its share of the batch, and their gradients are summed once per step.
 
     Args:
         objective: the loss, and what learns.
-        optimizer: takes the parameters.
+        optimizer: builds the optimizer of the parameters.
         schedule: factor on the learning rate as a function of the attempt's step.
-        progress: the run's place; it is changed here, and read by the loader.
+        progress: the run's progress, which is updated here and read by the loader.
         seed: the run's seed.
-        tile_points: most points that a tile may send through a field at once; None trains the batch whole.
+        tile_points: maximum number of points that a tile may send through a field at once; None trains the whole batch
+            at once.
         clip_norm: maximum norm of the gradient, to which larger ones are scaled down; None: no clipping.
-        sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
-        start_weights: the model's state from which attempts start (`draw_weights`); None: they draw it.
-        num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
-        jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
-            evaluation, so that steps differ in their pixels alone.
-        records: tells whether to record steps where the weights are now, and to replay them; None: no.
+        sample_budget: approximate number of samples per step, to which the number of rays adapts; None: it does not.
+        start_weights: the model's state from which attempts start (`draw_weights`); None: random weights.
+        num_steps: the length of the run, which the schedule follows; None: set by the trainer that runs it.
+        jitter: False: samples are in the middle of their intervals and one background is behind all rays, as at
+            evaluation, so that steps differ only in their pixels.
+        records: returns whether to record and replay steps on the weights' present device; None: no.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class TrainStep:
             measure_gradients: whether to measure the gradients' norms, before they are clipped.
 
         Raises:
-            InputError: the length of the run is not known, or there is no memory.
+            InputError: the length of the run is unknown, or memory runs out.
         """
         objective, progress = self.objective, self.progress
         if self.num_steps is None:
@@ -119,7 +120,7 @@ class TrainStep:
             return seen
 
     def _choose_batch(self) -> None:
-        """Choose how many rays the next steps have, as they have samples."""
+        """Choose the number of rays of the next steps by the number of samples per ray."""
         progress, model = self.progress, self.objective.model
         ranks.average(buffers_to_average(model))
         if self.sample_budget is not None:
@@ -127,25 +128,25 @@ class TrainStep:
             progress.batch_rays = batch_size(progress.largest_batch, wanted, self.objective.together)
 
     def begin_recording(self) -> None:
-        """Record steps from now on, where that was asked for and is possible, and replay them.
+        """Record and replay steps from now on, if requested and possible.
 
         Raises:
-            InputError: it was asked for, and something here decides on the host what a step computes.
+            InputError: it was requested, but a part decides on the host what a step computes.
         """
         if self.gradients is self.tiles and self.records is not None and self.records(self):
             self.gradients = RecordedGradients(self.tiles, self.guard)
 
     def new_optimizer(self) -> Optimizer:
-        """Return the optimizer of all that learns.
+        """Return the optimizer of all parameters.
 
         Raises:
-            InputError: a setting of the optimizer that it refuses.
+            InputError: the optimizer refuses a setting.
         """
         return optimizer_of(self.objective, self.build_optimizer)
 
     @property
     def key(self) -> int:
-        """Of the next step's random numbers."""
+        """Key of the next step's random numbers."""
         return fold(self.seed, self.progress.attempt, self.progress.step)
 
     @property

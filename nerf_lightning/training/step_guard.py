@@ -1,4 +1,4 @@
-"""Steps whose gradients are not finite are left out, before they ruin the weights."""
+"""Skip steps whose gradients are not finite, before they ruin the weights."""
 
 import math
 from collections.abc import Iterable
@@ -10,10 +10,10 @@ LARGE = 1 << 19
 
 
 class StepGuard:
-    """Decide whether a step may be taken, and count those that may not; `NanGuard` decides what becomes of the run.
+    """Decide whether a step may be taken, and count those that may not; `NanGuard` decides what happens to the run.
 
-    On the CPU the step is left out. Elsewhere reading the answer would stop the device, so the step is taken with
-    gradients of zero.
+    On the CPU the step is skipped. Elsewhere reading the answer would stall the device, so the step is taken with zero
+    gradients.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class StepGuard:
         _keep_finite(gradients, self._count(losses, gradients))
 
     def tensors(self, device: torch.device) -> list[Tensor]:
-        """Return what is counted, where it stays."""
+        """Return the counters, which keep their addresses."""
         if self.counts is None or self.counts.device != device:
             self.counts = torch.zeros(2, dtype=torch.long, device=device)
         if self.first_bad is None or self.first_bad.device != device:
@@ -44,8 +44,8 @@ class StepGuard:
         return [self.counts, self.first_bad]
 
     def _count(self, losses: Tensor, gradients: dict[str, Tensor]) -> Tensor:
-        """Return 1 where all is finite, else 0."""
-        # Large tables are left out: what reaches them has passed through the MLPs, whose gradients show it too.
+        """Return 1 if everything is finite, else 0."""
+        # Large tables are skipped: their gradients have passed through the MLPs, whose gradients show it, too.
         watched = {name: gradient for name, gradient in gradients.items() if gradient.numel() < LARGE}
         # Few operations, each of which is a launch on a GPU.
         sums = torch._foreach_norm([*watched.values(), losses], ord=1)
@@ -60,12 +60,12 @@ class StepGuard:
 
     @property
     def skipped(self) -> int:
-        """Steps left out so far."""
+        """Number of steps skipped so far."""
         return self.state()[0]
 
     @property
     def in_row(self) -> int:
-        """Steps left out since the last that was taken."""
+        """Number of steps skipped since the last one taken."""
         return self.state()[1]
 
     @property
@@ -74,11 +74,11 @@ class StepGuard:
         return "none" if self.first_bad is None else self.watched[int(self.first_bad)].rpartition(".")[0]
 
     def state(self) -> list[int]:
-        """What a checkpoint keeps."""
+        """Return the counts for a checkpoint."""
         return [0, 0] if self.counts is None else self.counts.tolist()
 
     def restore(self, state: list[int], device: torch.device) -> None:
-        """Take the counts up again."""
+        """Restore the counts."""
         self.tensors(device)[0].copy_(torch.tensor(state))
 
 

@@ -1,4 +1,4 @@
-"""The one LightningModule: it hands a trainer's batches to the step, and the run's state to checkpoints."""
+"""The only LightningModule: it passes a trainer's batches to the step, and the run's state to checkpoints."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,20 +33,20 @@ from nerf_lightning.training.validation import RayErrors
 class RadianceFieldSystem(LightningModule):
     """Train a radiance field on ray batches with Lightning.
 
-    A step cuts its batch into tiles whose gradients add up, hence the optimization is manual. What a step returns
-    reaches callbacks as `outputs["step"]` of `on_train_batch_end` (`StepOutput`).
+    A step cuts its batch into tiles whose gradients add up, hence the manual optimization. Callbacks get a step's
+    output (`StepOutput`) as `outputs["step"]` of `on_train_batch_end`.
 
     Args:
         train_step: takes the steps.
-        record: what a checkpoint needs to be used alone (config text, cameras, bounds).
-        resume_changed_capture: go on from a checkpoint of a capture that has changed, and warn.
+        record: what makes a checkpoint self-contained (config text, cameras, bounds).
+        resume_changed_capture: resume from a checkpoint even if its capture has changed, with a warning.
     """
 
     def __init__(self, train_step: TrainStep, record: dict[str, Any], resume_changed_capture: bool = False):
         super().__init__()
         self.automatic_optimization = False
         self.train_step, self.record, self.resume_changed_capture = train_step, record, resume_changed_capture
-        # Modules of the step are this module's, so that they move to the trainer's device and are saved.
+        # The step's modules are registered here, so that they move to the trainer's device and are saved.
         objective = train_step.objective
         self.model, self.rays = objective.model, objective.rays
         self.correction, self.loss = objective.correction, objective.loss
@@ -56,7 +56,7 @@ class RadianceFieldSystem(LightningModule):
     def load_from_checkpoint(  # type: ignore[override]
         cls, checkpoint_path: Any, map_location: Any = None, trust: Sequence[str] = ()
     ) -> Any:
-        """Return a system that renders and validates, of a file that may come from anybody; to train it has nothing.
+        """Return a system that renders and validates, from an untrusted file; it cannot train.
 
         Args:
             checkpoint_path: the file.
@@ -64,13 +64,13 @@ class RadianceFieldSystem(LightningModule):
             trust: modules of your own, such as ["my_parts"], whose model parts may be built.
 
         Raises:
-            InputError: it cannot be read, or asks for what is no part of a model of ours.
+            InputError: it cannot be read, or names something that is not a part of this program's models.
         """
         checkpoint = read_checkpoint(checkpoint_path)
         return cls(rendering_step(checkpoint, trust), checkpoint.record).to(map_location or "cpu").eval()
 
     def configure_callbacks(self) -> list[Any]:
-        """Return none; Lightning asks before it looks at its own settings, so what cannot be is refused here.
+        """Return none; Lightning calls this before it checks its own settings, so impossible ones are refused here.
 
         Raises:
             InputError: the trainer cannot fit this system.
@@ -83,34 +83,34 @@ class RadianceFieldSystem(LightningModule):
         """Return the step's optimizer.
 
         Raises:
-            InputError: a setting of the optimizer that it refuses.
+            InputError: the optimizer refuses a setting.
         """
         return self.train_step.new_optimizer()
 
     def on_fit_start(self) -> None:
-        """Take the length of the run from the trainer, and record its steps where that was asked for and is possible.
+        """Take the length of the run from the trainer, and record its steps if requested and possible.
 
         Raises:
-            InputError: it has none, or its steps cannot be recorded.
+            InputError: the run has no length, or its steps cannot be recorded.
         """
         self.train_step.num_steps = length_of_run(self.trainer, self.train_step.progress)
         self.train_step.begin_recording()
 
     def on_fit_end(self) -> None:
-        """Forget what was recorded: copies and pickles of the system are without it."""
+        """Discard recordings, so that copies and pickles of the system do not contain them."""
         self.train_step.gradients = self.train_step.tiles
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
-        """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
+        """Take one step, and return the sum of the levels' losses as `loss`, and its output (`StepOutput`) as `step`.
 
-        Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
+        Logs `train/loss` and `train/psnr` (dB, of the step's rays) unless a callback of `nerf train` does.
         """
         callbacks: list[Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
         watched = any(isinstance(each, Monitor) and each.wants_gradients(self.trainer, self) for each in callbacks)
         seen = self.train_step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen.losses.sum()
         if not any(isinstance(each, Monitor | TrainingProgress) for each in callbacks):
-            # What is on a bar is read in each step, for which the device is waited for.
+            # Values on a bar are read in each step, which waits for the device.
             on_bar = self.trainer.progress_bar_callback is not None
             self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=on_bar)
         return {"loss": loss, "step": seen}
@@ -123,7 +123,7 @@ class RadianceFieldSystem(LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Log loss and PSNR (dB) of the fixed rays.
 
-        While it fits they go straight to the loggers, since Lightning would count the step before.
+        While fitting they go directly to the loggers, since Lightning would log the step before.
         """
         values, fits = self.val_errors.summary(), self.trainer.state.fn == TrainerFn.FITTING
         shown = {"val/psnr": values["val/psnr"], "val/loss": 10.0 ** (-values["val/psnr"] / 10.0)}
@@ -134,11 +134,11 @@ class RadianceFieldSystem(LightningModule):
     def test_step(self, batch: Batch, batch_index: int) -> dict[str, float]:
         """Compare a whole view with its photograph, and return and log `psnr`, `cc_psnr` (dB) and `ssim`.
 
-        The means over the views, `test/psnr` and so on, are those of `nerf eval`, which looks at more: geometry, LPIPS,
-        and, where cameras were learned, how those of the test views have to move.
+        The means over the views, such as `test/psnr`, are those of `nerf eval`, which evaluates more: geometry, LPIPS
+        and, if cameras were learned, how those of the test views have to move.
 
         Raises:
-            InputError: the batch is no whole view.
+            InputError: the batch is not a whole view.
         """
         picture = self.predict_step(batch, batch_index)
         behind = background_colors(self.train_step.objective.background, 1, torch.device("cpu"), random=None)
@@ -152,7 +152,7 @@ class RadianceFieldSystem(LightningModule):
         """Render a whole view: color, depth in scene units, opacity.
 
         Raises:
-            InputError: the batch is no whole view.
+            InputError: the batch is not a whole view.
         """
         if batch.weight.dim() != 2:
             raise InputError(
@@ -164,7 +164,7 @@ class RadianceFieldSystem(LightningModule):
         return render_picture(self.model, self.rays, view, background, tile_points)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what makes the file self-contained, and the run's state beyond weights and optimizer.
+        """Add what makes the file self-contained, and the run's state besides weights and optimizer.
 
         Raises:
             InputError: the weights are not finite.
@@ -178,7 +178,7 @@ class RadianceFieldSystem(LightningModule):
         checkpoint[KEY] = self.kept_record()
 
     def kept_record(self) -> dict[str, Any]:
-        """Return what makes a checkpoint self-contained, and the run's state beyond weights and optimizer."""
+        """Return what makes a checkpoint self-contained, and the run's state besides weights and optimizer."""
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
         return self.record | run_state(self.train_step) | ({} if refined is None else {"refined": dict(vars(refined))})
 
@@ -186,10 +186,10 @@ class RadianceFieldSystem(LightningModule):
         """Check what Lightning is about to restore, and restore the rest of the run.
 
         Raises:
-            InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
+            InputError: the checkpoint does not belong to this run or its capture; nothing was restored from it.
         """
         trainer, train_step, path = self.trainer, self.train_step, Path(self.trainer.ckpt_path or LAST)
-        if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # Lightning's own has checked nothing
+        if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # Lightning's own checks nothing
             content = read_content(path)
             checkpoint.clear()
             checkpoint.update(content)

@@ -1,4 +1,4 @@
-"""TensorBoard's names for what a run logs: it shows groups by their names' order, capital letters first."""
+"""TensorBoard's names for what a run logs: it sorts groups by name, capital letters first."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,10 +14,10 @@ GROUPS = (
     ("validation/picture", "Pictures/validation"),
     ("scene/cameras", "Pictures/cameras"),
 )
-"""Beginnings of names and their groups. Between PSNR and losses stand the pictures, and histograms come last."""
+"""Prefixes of names and their groups. Pictures come between PSNR and losses, and histograms last."""
 ALONG_RAYS, PER_RAY = "weights_along_rays/weight", "weights_per_ray/effective_samples"
 WHOLE = ("val/psnr", "test/psnr", "train/loss", "validation/picture", "scene/cameras")
-"""Names that are no beginnings of others."""
+"""Names that are not prefixes of others."""
 
 
 class OrderedTensorBoard(TensorBoardLogger):
@@ -27,7 +27,7 @@ class OrderedTensorBoard(TensorBoardLogger):
         save_dir: the run folder.
         name: the folder of the files, in the run folder.
         version: a folder in that one; empty: none.
-        purge_step: the first step that is forgotten of what an earlier start wrote.
+        purge_step: the first step of which an earlier start's data is discarded.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class OrderedTensorBoard(TensorBoardLogger):
 
 
 def shown_name(name: str) -> str:
-    """Return where TensorBoard shows a scalar or a picture.
+    """Return the name under which TensorBoard shows a scalar or a picture.
 
     >>> [shown_name(name) for name in ("val/psnr", "val/psnr_standard_error", "train/loss_fine", "speed/rays_per_step")]
     ['PSNR/validation', 'val/psnr_standard_error', 'Training loss/fine', 'speed/rays_per_step']

@@ -20,12 +20,12 @@ class RayErrors:
         self.parts: list[Tensor] = []
 
     def of(self, objective: Objective, batch: Batch, tile_points: int | None) -> Float[Tensor, ""]:
-        """Take note of a batch's rays, and return their mean squared error; rays that a mask leaves out do not count.
+        """Record a batch's rays, and return their mean squared error; masked rays do not count.
 
         Args:
             objective: renders them.
             batch: fixed rays.
-            tile_points: most points that go through a field at once; None: all.
+            tile_points: maximum number of points that go through a field at once; None: all.
         """
         rgb, target = torch.empty_like(batch.rgba[:, :3]), torch.empty_like(batch.rgba[:, :3])
         pixels = batch.num_rays if tile_points is None else pixels_in_tile(objective.model, tile_points)
@@ -37,12 +37,12 @@ class RayErrors:
         return (error * batch.weight).sum() / batch.weight.sum().clamp(min=1.0)
 
     def add(self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]) -> None:
-        """Take note of some rays; those of weight 0 do not count."""
+        """Record some rays; those of weight 0 do not count."""
         self.parts.append(torch.stack([(rgb - target).square().mean(dim=-1), weight]))
 
     def summary(self) -> dict[str, float]:
-        """Return the PSNR of all rays and its standard error (delta method), and begin anew."""
-        # Masked on the host: on XLA a size that depends on data stops the device.
+        """Return the PSNR of all rays and its standard error (delta method), and reset."""
+        # Masked on the host: on XLA, data-dependent sizes stall the device.
         error, weight = torch.cat(self.parts, dim=-1).cpu()
         self.parts.clear()
         error = error[weight > 0].double()

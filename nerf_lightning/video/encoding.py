@@ -1,7 +1,7 @@
-"""Films as one file: by ffmpeg H.264 in mp4, with alpha VP9 in webm and ProRes 4444 in mov; and animated WebP.
+"""Films as one file: with ffmpeg, H.264 in mp4, and with alpha VP9 in webm and ProRes 4444 in mov; and animated WebP.
 
-ffmpeg (imageio-ffmpeg carries one) is run here, not by imageio's writer, which rescales odd sizes and says nothing when
-it fails.
+ffmpeg (imageio-ffmpeg includes one) is run directly, not by imageio's writer, which rescales odd sizes and fails
+silently.
 """
 
 import shutil
@@ -22,27 +22,27 @@ from torch import Tensor
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.errors import InputError
 
-# The picture is converted by the rule of BT.709 and says so: untagged, players guess the rule from the size.
-# Newer ffmpegs convert by the tag alone, those before 7 need the filter.
+# The picture is converted by BT.709 and tagged so: untagged, players guess the matrix from the size. Newer ffmpegs
+# convert by the tag alone; those before 7 need the filter.
 _COLORS = "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
 
 
 @dataclass(frozen=True)
 class Codec:
-    """How ffmpeg writes the videos of one ending."""
+    """How ffmpeg writes videos with one file ending."""
 
     encoder: str
     settings: str
     plain: str
-    """Format of the pixels of pictures without alpha."""
+    """Pixel format of pictures without alpha."""
     with_alpha: str | None
-    """Of those with it; None: it has none."""
+    """Pixel format of pictures with alpha; None: not supported."""
 
 
 CODECS = {
     # yuv420p and faststart: what browsers and phones can play, from the first byte on.
     ".mp4": Codec("libx264", "-crf 16 -preset medium -movflags +faststart -f mp4", "yuv420p", None),
-    # Frames out of order, which alt-refs are, would come without their alpha.
+    # Out-of-order frames, such as alt-refs, would lose their alpha.
     ".webm": Codec(
         "libvpx-vp9", "-crf 20 -b:v 0 -deadline good -cpu-used 3 -auto-alt-ref 0 -f webm", "yuv420p", "yuva420p"
     ),
@@ -55,18 +55,18 @@ def write_video(
 ) -> None:
     """Write frames of one size as a video, whole or not at all.
 
-    Frames are taken one at a time and never rescaled. The codecs want even sides: an odd one gets one more pixel,
-    a copy of the edge.
+    Frames are taken one at a time and never rescaled. The codecs need even sides: an odd one gets one more pixel, a
+    copy of the edge.
 
     Args:
-        path: where to. It ends in .mp4, which plays everywhere, or, for frames with alpha too, in .webm or .mov.
-            Missing folders are made.
-        frames: pictures in RGB, or in RGB and straight alpha, row 0 on top.
+        path: the file, ending in .mp4, which plays everywhere, or, for frames with alpha, too, in .webm or .mov.
+            Missing folders are created.
+        frames: pictures in RGB, or RGB with straight alpha, row 0 on top.
         fps: frames per second.
-        total: how many frames there should be, where it is known.
+        total: expected number of frames, if known.
 
     Raises:
-        InputError: the name has another ending, there is no ffmpeg, or ffmpeg fails (it is quoted).
+        InputError: the name has another ending, there is no ffmpeg, or ffmpeg fails (its error is quoted).
         ValueError: no frames, another number than `total`, frames of different sizes, or with alpha in an mp4.
     """
     codec = CODECS.get(path.suffix.lower())
@@ -79,14 +79,14 @@ def write_video(
             pipe.write(pad_to_even(frame).contiguous().numpy().tobytes())
 
 
-LARGEST_SIDE = 16383  # Of a WebP, in pixels.
+LARGEST_SIDE = 16383  # Of a WebP, in pixels
 QUALITY = 80
 
 
 def write_animation(
     path: Path, frames: Iterable[UInt8[Tensor, "height width channels"]], fps: int, total: int | None = None
 ) -> None:
-    """Write frames as an animated WebP, which pages and messages play by themselves, in a loop without end.
+    """Write frames as an animated WebP, which pages and messages play by themselves in an endless loop.
 
     The arguments are those of `write_video`; each frame is shown for a whole number of milliseconds, equal neighbors
     as one.
@@ -105,7 +105,7 @@ def write_animation(
 
 
 def _counted(path: Path, frames: Iterable[Tensor], total: int | None) -> tuple[Tensor, Iterator[Tensor]]:
-    """Return the first frame, and all of them, which end in a ValueError where they are not as promised."""
+    """Return the first frame, and an iterator over all, which raises a ValueError if they are not as promised."""
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
@@ -134,7 +134,7 @@ def pad_to_even(picture: UInt8[Tensor, "height width channels"]) -> UInt8[Tensor
 
 @contextmanager
 def _encoder(path: Path, codec: Codec, size: tuple[int, int], has_alpha: bool, fps: int) -> Iterator[IO[bytes]]:
-    """Lend the pipe that takes raw frames; wait for ffmpeg at the end, and stop it at once on an error."""
+    """Yield the pipe for raw frames; wait for ffmpeg at the end, and stop it at once on an error."""
     pixels, stored = ("rgba", codec.with_alpha) if has_alpha else ("rgb24", codec.plain)
     if stored is None:
         raise ValueError(f"{path}: {codec.encoder} has no alpha")
@@ -152,12 +152,12 @@ def _encoder(path: Path, codec: Codec, size: tuple[int, int], has_alpha: bool, f
             yield process.stdin
             process.stdin.close()
         except BrokenPipeError as error:
-            broken = error  # ffmpeg has given up: its own words, read below, say more
+            broken = error  # ffmpeg has failed: its own message, read below, says more
         except BaseException:
             process.kill()
             raise
         finally:
-            with suppress(BrokenPipeError):  # closing writes what is left, perhaps to nobody
+            with suppress(BrokenPipeError):  # closing writes what is left, perhaps to a closed pipe
                 process.stdin.close()
             code = process.wait()
         if code != 0:
@@ -175,7 +175,7 @@ _CURE = (
 
 
 def require_encoder(ending: str) -> None:
-    """Refuse videos of an ending whose encoder this machine's ffmpeg lacks, and all where there is no ffmpeg."""
+    """Refuse videos with an ending whose encoder this machine's ffmpeg lacks, and all videos without ffmpeg."""
     name, program = CODECS[ending].encoder, require_ffmpeg()
     asked = [program, "-v", "error", "-hide_banner", "-h", f"encoder={name}"]
     try:
@@ -187,7 +187,7 @@ def require_encoder(ending: str) -> None:
 
 
 def require_ffmpeg() -> str:
-    """Return where ffmpeg is, or say how it is installed."""
+    """Return where ffmpeg is, or say how to install it."""
     import imageio_ffmpeg
 
     try:

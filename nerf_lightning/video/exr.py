@@ -1,4 +1,4 @@
-"""Frames for compositing as EXR, by OpenEXR: colors in linear light, and depth, as floats."""
+"""Frames for compositing as EXR, with OpenEXR: colors in linear light, and depth, as floats."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,15 +13,15 @@ from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
-NOTHING = 1e10  # The depth of a pixel that stops less than half of the light, as Blender writes it.
+NOTHING = 1e10  # The depth of a pixel that stops less than half of the light, as in Blender.
 
 
 def exr_channels(
     picture: Picture, depth: Float[Tensor, "height width"] | None, colors: bool, alpha: bool
 ) -> dict[str, Float[Tensor, "height width"]]:
-    """Return what a frame holds, by the names that compositors know: Z of `depth`, R, G, B of `colors`, A of `alpha`.
+    """Return a frame's channels by the names that compositors use: Z for `depth`, R, G, B for `colors`, A for `alpha`.
 
-    With alpha, colors are multiplied with it, as EXR has them; then the picture has been rendered over black.
+    With alpha, colors are premultiplied, as in EXR; the picture must then have been rendered over black.
     """
     channels: dict[str, Tensor] = {}
     if colors:
@@ -37,7 +37,7 @@ def exr_channels(
 
 
 def save_exr(path: Path, channels: Mapping[str, Float[Tensor, "height width"]], unit: str) -> None:
-    """Write one frame, whose depth is in `unit`, in 32-bit floats: whole or not at all. Missing folders are made."""
+    """Write one frame, whose depth is in `unit`, in 32-bit floats, whole or not at all. Missing folders are created."""
     openexr = require_openexr()
     comments = f"R, G, B: linear light. Z: distance from the camera in {unit}, 1e10 where nothing is."
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, "comments": comments}
@@ -45,10 +45,10 @@ def save_exr(path: Path, channels: Mapping[str, Float[Tensor, "height width"]], 
     with whole_file(path) as part:
         try:
             openexr.File(header, content).write(str(part))
-        except RuntimeError as error:  # what its library throws, a full disk among it
+        except RuntimeError as error:  # what its library throws, including for a full disk
             raise OSError(str(error)) from error
 
 
 def require_openexr() -> Any:
-    """Return the module, or say how it is installed."""
+    """Return the module, or say how to install it."""
     return require_extra("OpenEXR", "exr", "format=exr")

@@ -1,4 +1,4 @@
-"""Film models along a camera path: color, depth and more, as videos or as frames, where there is memory for one."""
+"""Film models along a camera path: color, depth and more, as videos or frames, if a frame fits into memory."""
 
 import hashlib
 import json
@@ -33,14 +33,14 @@ log = logging.getLogger(__name__)
 def film(
     subjects: list[Subject], path: CameraPath, tile_points: int, folder: Path, settings: FilmSettings | None = None
 ) -> list[Path]:
-    """Write the films (`video.mp4`, `depth.mp4`; or folders of frames of these names) and return where they are.
+    """Write the films (`video.mp4`, `depth.mp4`, or folders of frames of these names) and return their paths.
 
-    A film that was stopped goes on with its missing frames. Depth is along the ray, in meters where the capture's unit
-    is known and else in its own, colored over the range of what is seen on the whole path, with its scale beside it.
-    Several models of one capture are shown side by side. Without settings, color and depth are filmed, as videos.
+    An interrupted film continues with its missing frames. Depth is along the ray, in meters if the capture's unit is
+    known and else in its own, colored over the range of what is seen on the whole path, with its scale next to it.
+    Several models of one capture are shown side by side. Without settings, color and depth are filmed as videos.
 
     Raises:
-        InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
+        InputError: what is requested cannot be filmed or written; finished frames are kept.
     """
     settings = settings or FilmSettings()
     _check(subjects, settings)
@@ -49,14 +49,14 @@ def film(
     shots = make_shots(subjects, path, tile_points, settings)
     require_room(shots[0].cameras, settings, len(subjects))
     for name in [name for name in settings.outputs if name not in FILMS]:
-        channel_picture(name, shots[0].picture(0))  # or says that there is none, before anything is written
+        channel_picture(name, shots[0].picture(0))  # or raises that there is none, before anything is written
     first = shots[0].subject.scene
     films = ["mosaic"] if settings.mosaic else [FILMS.get(name, name) for name in settings.outputs]
     if settings.form == "exr":
         films = ["exr"]  # all in one file
     frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form, [FILMS["rgb"]] * settings.alpha)
     try:
-        # The first process alone looks, before any of them writes.
+        # Only the first process looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         if "depth" in settings.outputs and ranks.is_first():
             log.info("depth is in %s, mostly from %.3g to %.3g", told_length(first)[1], *seen)
@@ -111,7 +111,7 @@ def _check(subjects: list[Subject], settings: FilmSettings) -> None:
 
 
 def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
-    """Return what tells films apart: the weights, the cameras, and all settings that decide what is seen."""
+    """Return a fingerprint of a film: the weights, the cameras, and all settings that decide what is seen."""
     digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
     for shot in shots:
         digest.update(f"{shot.subject.label} {shot.subject.background} {shot.unit}".encode())
@@ -125,18 +125,18 @@ def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
 
 
 PICTURE = 40  # Bytes per pixel, measured on the CPU, of the picture rendered.
-SURFACE = 80  # Where the surface is looked at too: its points and normals, or the channels of an EXR.
-PANEL = 16  # What is shown of it: a panel, its caption and its place in the frame.
+SURFACE = 80  # If the surface is used, too: its points and normals, or the channels of an EXR.
+PANEL = 16  # What is shown: a panel, its caption and its place in the frame.
 
 
 def bytes_per_pixel(settings: FilmSettings, num_models: int) -> int:
-    """Return what a frame takes for each pixel of a panel; models are rendered one after the other."""
+    """Return the memory of a frame per pixel of a panel; models are rendered one after another."""
     surface = SURFACE if "normals" in settings.outputs or settings.form == "exr" else 0
     return PICTURE + surface + PANEL * len(settings.outputs) * num_models
 
 
 def require_room(cameras: Cameras, settings: FilmSettings, num_models: int = 1) -> None:
-    """Refuse frames (of cameras of one size) that take more memory than can be had, in all processes."""
+    """Refuse frames (of cameras of one size) that take more memory than is available, in all processes."""
     width, height = int(cameras.width[0]), int(cameras.height[0])
     together = processes_here() if ranks.world_size() > 1 else 1
     each = together * bytes_per_pixel(settings, num_models)

@@ -1,7 +1,7 @@
-"""The frames of a film on the disk: each is written as soon as it is rendered, so a stopped film goes on.
+"""The frames of a film on disk: each is written as soon as it is rendered, so an interrupted film can continue.
 
 `.frames/film.json` in the output folder says which film the frames belong to (a fingerprint of all that decides what is
-seen) and over which depths their colors reach.
+seen) and the range of depths of their colors.
 """
 
 import logging
@@ -31,11 +31,11 @@ class FilmFrames:
     """Frames of one or more films of equal length.
 
     Args:
-        films: their names; they go into `folder`.
-        count: how many frames each has.
-        form: `frames` and `exr` are the result; the others keep frames in a hidden folder until one file is made of
-            them.
-        transparent: those of the films whose frames have alpha.
+        films: names of the films, which are written to `folder`.
+        count: number of frames of each.
+        form: with `frames` and `exr`, frames are the result; other forms keep them in a hidden folder until they are
+            encoded to a file.
+        transparent: the films whose frames have alpha.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class FilmFrames:
         self.suffix = ".exr" if form == "exr" else ".png"
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
-        """Take hold of the folder; return the frames that are missing, and the range of the depth's colors.
+        """Lock the folder, and return the missing frames and the range of the depth's colors.
 
-        Frames of another film are removed, and the range is measured anew. A folder that another process films into, or
-        whose files are not ours, is refused.
+        If the frames belong to another film, they are removed, and the range is measured again. A folder that another
+        process writes to, or that has foreign files, is refused.
         """
         with self._kept():
             self.scratch.hold()
@@ -80,14 +80,14 @@ class FilmFrames:
         return missing, (near, far)
 
     def save(self, film: str, number: int, write: Callable[[Path], None]) -> None:
-        """Keep one frame, which `write` writes to a file."""
+        """Save one frame, which `write` writes to a file."""
         with self._resumable():
             file = self._file(film, number)
             make_folder(self.folder, *file.parent.relative_to(self.folder).parts)
             write(file)
 
     def finish(self, fps: int) -> None:
-        """Make the films of the frames, remove these, and let others have the folder; on an error the frames stay."""
+        """Make films from the frames, remove these, and unlock the folder; on an error the frames stay."""
         if ENDINGS[self.form]:
             write = write_animation if self.form == "animation" else write_video
             for film, file in zip(self.films, self.results(), strict=True):
@@ -98,7 +98,7 @@ class FilmFrames:
             self.close()
 
     def close(self) -> None:
-        """Let others have the folder; the frames stay."""
+        """Unlock the folder; the frames stay."""
         self.scratch.release()
 
     def results(self) -> list[Path]:

@@ -1,4 +1,4 @@
-"""The panels of a film: what is shown of a rendered view, and how panels make one picture."""
+"""The panels of a film: what is shown of a rendered view, and how panels form a picture."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -22,7 +22,7 @@ from nerf_lightning.visualization.pictures import (
 )
 
 FILMS = {"rgb": "video", "depth": "depth", "opacity": "opacity", "normals": "normals", "levels": "levels"}
-"""What can be shown of every model, and the name of its film. Any other name is a channel of the model's field."""
+"""Outputs of every model, and the names of their films. Any other name is a channel of the model's field."""
 
 
 def panel(
@@ -36,7 +36,7 @@ def panel(
 
     `levels` is the absolute difference of the first level that makes pictures and the last; `normals` are the
     surface's, as colors: 0.5 + 0.5 n along the axes of the capture's own frame. `depth_range` is near and far of the
-    depth's colors, in meters or the user's units, of which `unit` make one of the scene's.
+    depth's colors, in meters or the user's units, of which `unit` make one of the scene's units.
     """
     if output == "depth":
         return depth_picture(unit * picture.depth, *depth_range, picture.opacity)
@@ -50,7 +50,7 @@ def panel(
 
 
 def channel_picture(name: str, picture: Picture) -> UInt8[Tensor, "height width 3"]:
-    """Return a channel as a picture: one number a pixel in gray, three as colors, more in the color of the largest.
+    """Return a channel as a picture: one number per pixel in gray, three as colors, more in the color of the largest.
 
     Numbers are shown as they are, from 0 to 1.
     """
@@ -72,7 +72,7 @@ def film_pictures(
 
     Args:
         panels: for each model its panels by output.
-        labels: what the models are called; where there are several, their panels stand side by side under their names.
+        labels: names of the models; if there are several, their panels are side by side under their names.
         mosaic: one film, with a column for each output and a row for each model.
     """
     several = len(panels) > 1

@@ -1,4 +1,4 @@
-"""What `nerf render` films, as its config says it."""
+"""The settings of what `nerf render` films."""
 
 import math
 from collections.abc import Mapping
@@ -25,24 +25,24 @@ class FilmSettings:
     outputs: tuple[str, ...] = ("rgb", "depth")
     """Keys of `video.panels.FILMS`, or channels of the model's field."""
     mosaic: bool = False
-    """One film of all outputs, in place of one for each."""
+    """One film of all outputs instead of one for each."""
     form: Form = "video"
     alpha: bool = False
-    """The film of the colors has them straight, with the opacity as alpha; nothing lies behind the scene."""
+    """The film of the colors has straight colors, with the opacity as alpha; nothing is behind the scene."""
     near: float | None = None
-    """Where rays begin; None: where the photographs' do."""
+    """Where rays begin; None: as for the photographs."""
     crop: tuple[Corner, Corner] | None = None
     """Lower and upper corner of a box, outside of which nothing is shown."""
     hold_camera: bool = False
-    """Stay at the first camera, and let only the direction from which color is looked up move."""
+    """Stay at the first camera, and move only the direction from which color is looked up."""
     projection: Projection = "perspective"
-    """Equirectangular: each frame is a panorama of all directions, whose middle is where the camera looks."""
+    """Equirectangular: each frame is a panorama of all directions, centered where the camera looks."""
     precision: str | None = None
-    """What the models compute in, as the caller has seen to; frames of another precision belong to another film."""
+    """The models' precision, which the caller has set; frames of another precision belong to another film."""
 
 
 def film_settings(config: Mapping[str, Any]) -> FilmSettings:
-    """Return what is to be filmed, by settings that are plain values; those that make no film are refused."""
+    """Return the settings of a film, given plain values; invalid ones are refused."""
     for name in SWITCHES:
         if not isinstance(config[name], bool):
             raise InputError(f"{name}={config[name]} is not valid: it must be true or false.")
@@ -85,7 +85,7 @@ def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
 
 
 def as_list(value: Any) -> list[Any]:
-    """Return one value or a list of them as a list."""
+    """Return one value or a list of values as a list."""
     return list(value) if isinstance(value, list) else [value]
 
 

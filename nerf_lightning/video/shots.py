@@ -1,4 +1,4 @@
-"""What each frame of a film shows of each model: cameras in the model's frame, where rays begin and end."""
+"""What each frame of a film shows of each model: cameras in the model's frame, and where rays begin and end."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -31,17 +31,17 @@ from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame, fram
 from nerf_lightning.video.paths.sweep import MIDDLE
 from nerf_lightning.video.settings import FilmSettings
 
-# The range of the depth's colors is taken from so many frames, with at most so many pixels along their longer side.
+# Number of frames that the range of the depth's colors is taken from, and the maximum length of their longer side.
 PROBES, PROBE_PIXELS = 12, 64
 MOST_POINTS = 1000  # Of the content
-IN_MOST = 0.5  # Of the views: what these show in their middle is what the capture is about.
+IN_MOST = 0.5  # Share of the views: what these show in their middle is the subject of the capture.
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model to be filmed, and where it was learned."""
+    """A model to film, and the scene it was learned from."""
 
     model: Model
     scene: SceneRecord
@@ -56,7 +56,7 @@ class Shot:
     subject: Subject
     cameras: Cameras
     seen_from: Cameras | None
-    """Cameras whose directions the color is looked up from, where the camera itself is held."""
+    """Cameras whose directions determine the color, if the camera itself is held."""
     near: Float[Tensor, "frames"]
     far: Float[Tensor, "frames"]
     clip: Clip | None
@@ -64,12 +64,12 @@ class Shot:
 
     @property
     def unit(self) -> float:
-        """How many meters, or where nobody knows units of the user's, make a unit of the scene's."""
+        """How many meters, or user's units if their length is unknown, make one of the scene's."""
         return told_length(self.subject.scene)[0]
 
     @property
     def rays(self) -> RayGenerator:
-        """What makes the rays of the frames."""
+        """The generator of the frames' rays."""
         return RayGenerator(self.cameras, self.near, self.far)
 
     def picture(self, frame: int) -> Picture:
@@ -79,26 +79,26 @@ class Shot:
         return render_picture(model, self.rays, frame, background, self.tile_points, self.clip, looked_up)
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
-        """Return the unit normals of what the picture shows, in the user's axes."""
+        """Return the unit normals of the picture's surface, in the user's axes."""
         normals = normals_from_depth(self.surface(frame, picture))
         to_user = self.subject.scene.to_user
         return normals @ (to_user[:3, :3] / unit_of(to_user)).mT.to(normals)
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
-        """Return how far what the picture shows lies from the camera, in meters or the user's units (`unit`).
+        """Return the depth of the picture's surface from the camera, in meters or the user's units (`unit`).
 
-        Along the camera's axis; of a panorama, which has none, along the ray.
+        It is along the camera's axis; for a panorama, which has none, along the ray.
         """
         local = camera_coordinates(self.cameras, frame, self.surface(frame, picture))
         panorama = self.cameras.lens_model == "equirectangular"
         return self.unit * (local.norm(dim=-1) if panorama else -local[..., 2])
 
     def surface(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
-        """Return the points of the scene that the picture shows."""
+        """Return the points of the picture's surface."""
         return picture_surface(self.rays, frame, picture, self.clip)[1]
 
     def small(self) -> "Shot":
-        """Return a few of the frames, in small."""
+        """Return a few of the frames, at a small size."""
         chosen = evenly_spaced_subset(range(len(self.cameras.c2w)), PROBES)
         cameras = at_most(self.cameras[chosen], PROBE_PIXELS)
         return replace(self, cameras=cameras, seen_from=None, near=self.near[chosen], far=self.far[chosen])
@@ -133,25 +133,25 @@ def make_shots(
 
 
 def shot_of(subject: Subject, cameras: Cameras, tile_points: int) -> Shot:
-    """Return what cameras in a model's frame see of it."""
+    """Return the shot of a model by cameras in its frame."""
     near, far = near_and_far_from(cameras.c2w[:, :, 3], subject.scene)
     return Shot(subject, _bent(cameras, subject.scene), None, near, far, clip=None, tile_points=tile_points)
 
 
 def lay_path(path: CameraPath, scene: SceneRecord, content: Content = PathFrame.content) -> Cameras:
-    """Return the cameras of a path around a scene, or say why it cannot be laid there."""
+    """Return the cameras of a path around a scene, or say why the path does not fit."""
     return path.cameras(frame_around(scene, content))
 
 
 def frame_around(scene: SceneRecord, content: Content = PathFrame.content) -> PathFrame:
-    """Return the frame in which paths around a scene are laid."""
+    """Return the frame of reference of paths around a scene."""
     frame = frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names)
     return replace(frame, bounded=scene.space == "bounded", content=content)
 
 
 @torch.no_grad()
 def content_of(subject: Subject, tile_points: int) -> Float[Tensor, "points 3"]:
-    """Return points that a few small training views show, those in the middle of most of these views."""
+    """Return points that a few small training views show, if they are in the middle of most of these views."""
     shot = shot_of(subject, subject.scene.cameras[list(subject.scene.splits["train"])], tile_points).small()
     views, points = range(len(shot.cameras.c2w)), []
     for view in views:
@@ -173,7 +173,7 @@ def _in_middle(cameras: Cameras, view: int, points: Float[Tensor, "points 3"]) -
 def depth_range(shots: list[Shot]) -> tuple[float, float]:
     """Return near and far of what is seen on the whole path, in the shots' units, from a few small frames.
 
-    The outer 1 % at each end are left out. Where nothing is seen they are the scene's own.
+    The outer 1 % at each end are left out. If nothing is seen, they are the scene's own.
     """
     seen = []
     for shot in map(Shot.small, shots):
@@ -196,7 +196,7 @@ def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
 
 
 def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Cameras:
-    """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
+    """Return panoramic cameras at the same places, with pictures twice as wide as high unless the user sets a size."""
     if scene.cameras.ndc is not None:
         raise InputError(
             f"projection=equirectangular looks in all directions, but {scene.name} was trained in normalized device "
@@ -213,7 +213,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
 
 
 def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Cameras:
-    """Return cameras of the first scene's working frame as another's."""
+    """Return cameras of the first scene's working frame in another's."""
     if torch.equal(first.to_user, scene.to_user):
         return cameras
     apart = torch.linalg.inv(first.to_user.double()) @ scene.to_user.double()
@@ -221,7 +221,7 @@ def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Ca
 
 
 def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
-    """Return the cameras with rays through normalized device coordinates, where the scene was learned in these."""
+    """Return the cameras, with rays in normalized device coordinates if the scene was learned in these."""
     if scene.cameras.ndc is None:
         return cameras
     count = len(cameras.c2w)

@@ -1,4 +1,4 @@
-"""Where the cameras of a capture stand: from above and from the side, and from where the scene was seen."""
+"""The camera layout of a capture, from above and from the side, and the directions from which the scene was seen."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 COLOURS = {"train": "#2f6db3", "held out": "#e07b39"}
 CONTENT, BOX, GAP = "#8a8f98", "#3c9d6b", "#f3d9d6"
-CELL, NEAR_ENOUGH = 3, 15.0  # Degrees of a cell of the coverage map; it counts as seen within this angle of a camera.
+CELL, NEAR_ENOUGH = 3, 15.0  # Degrees of a cell of the coverage map, and within which of a camera it counts as seen
 MOST_POINTS = 4000
 
 
@@ -37,7 +37,7 @@ def draw_layout(above: "Axes", side: "Axes", scene: Scene, content: Float[Tensor
 
 
 def coverage_picture(scene: SceneRecord, width: int = 900, height: int = 460) -> UInt8[Tensor, "height width 3"]:
-    """Return the coverage map alone; it needs the cameras and no photograph."""
+    """Return only the coverage map, which needs the cameras but no photographs."""
     figure = new_figure(width, height)
     draw_coverage(figure.subplots(), scene)
     return picture_of(figure)
@@ -107,7 +107,7 @@ def _draw_cameras(
 
 
 def _frustum(scene: Scene, view: int, length: float) -> Float[np.ndarray, "lines 2 3"]:
-    """Return the eight edges of a view's pyramid."""
+    """Return the eight edges of a view's frustum."""
     cameras = scene.cameras
     size = torch.stack([cameras.width[view], cameras.height[view]])
     ends = torch.stack([torch.zeros(2), size]).float()
@@ -122,7 +122,7 @@ def _frustum(scene: Scene, view: int, length: float) -> Float[np.ndarray, "lines
 
 
 def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
-    # Forward-facing: what matters is between which places the cameras stood.
+    # Forward-facing: what matters is the extent of the cameras' positions.
     x, y, _ = scene.cameras.c2w[:, :, 3].unbind(dim=-1)
     for split, views in _splits(scene).items():
         at = list(views)

@@ -1,4 +1,4 @@
-"""Figures with axes, drawn by matplotlib's objects: no pyplot, so nothing global stays behind."""
+"""Figures with axes, drawn with matplotlib's objects: without pyplot, there is no global state."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -19,9 +19,9 @@ _LINE = "#3b5b92"
 def loss_curve(
     steps: Sequence[int], values: Sequence[float], label: str = "loss", width: int = 640, height: int = 400
 ) -> UInt8[Tensor, "height width 3"]:
-    """Return the picture (`width` by `height` pixels) of a quantity over the steps, on a logarithmic axis.
+    """Return a plot (`width` by `height` pixels) of a quantity over the steps, on a logarithmic axis.
 
-    Values that are not positive and finite have no place on that axis and leave a gap.
+    Values that are not positive and finite leave a gap.
     """
     figure = new_figure(width, height)
     _draw_curve(figure.subplots(), steps, values, label)
@@ -55,7 +55,7 @@ def epoch_figure(
 
 
 def new_figure(width: int, height: int) -> "Figure":
-    """Return an empty figure of so many pixels that lays itself out."""
+    """Return an empty figure of `width` by `height` pixels that lays itself out."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -66,7 +66,7 @@ def new_figure(width: int, height: int) -> "Figure":
 def _draw_curve(axes: "Axes", steps: Sequence[int], values: Sequence[float], label: str) -> None:
     shown = np.array(values, dtype=float)
     shown[~((shown > 0) & np.isfinite(shown))] = np.nan
-    # A lone point makes no line; a mark shows it.
+    # A single point makes no line, so it gets a marker.
     axes.plot(np.array(steps), shown, color=_LINE, linewidth=1.4, marker="o" if len(shown) < 2 else None)
     if np.isfinite(shown).any():
         axes.set_yscale("log")

@@ -18,20 +18,20 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.row_chunks import row_chunks
 
-ENOUGH_PIXELS = 1 << 18  # For the range of what is visible.
-ERROR_SCALE = 0.25  # Absolute error that gets the brightest color: always the same, so that two runs can be compared.
+ENOUGH_PIXELS = 1 << 18  # Enough for the range of what is visible
+ERROR_SCALE = 0.25  # Absolute error of the brightest color: always the same, so that runs can be compared.
 
 LONGEST_PANEL = 1600
-"""Pixels along the longer side of a panel of the validation picture, about, at most: a row of four photographs would
-be more than anything shows."""
+"""Approximate maximum length in pixels of the longer side of a panel of the validation picture: a row of four
+photographs would be larger than any display."""
 
 PAPER = 255
 _INK = (64, 64, 64)
-_BACKDROP = 0.93  # Gray of what no ray hits: no color of the map is gray, so it reads as neither near nor far.
+_BACKDROP = 0.93  # Gray where no ray hits: no color of the map is gray, so it reads as neither near nor far.
 
 
 def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
-    """Return colors in [0, 1] as bytes on the CPU: clamped, then rounded to the nearest; NaN becomes black.
+    """Return colors in [0, 1] as bytes on the CPU: clamped, then rounded to nearest; NaN becomes black.
 
     >>> to_bytes(torch.tensor([[-1.0, 0.5, 2.0]])).tolist()
     [[0, 128, 255]]
@@ -45,27 +45,27 @@ def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
 def straight_colors(
     rgb: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
 ) -> UInt8[Tensor, "height width 4"]:
-    """Return what was rendered over black as straight colors and alpha; where nothing is seen, all four are 0.
+    """Return straight colors and alpha of a picture rendered over black; where nothing is seen, all four are 0.
 
     >>> straight_colors(torch.tensor([[[0.25, 0.0, 0.5]]]), torch.tensor([[0.5]])).tolist()
     [[[128, 0, 255, 128]]]
     """
     alpha = opacity[..., None]
-    shown = alpha > 0.5 / 255  # what alpha has as bytes
+    shown = alpha > 0.5 / 255  # nonzero in bytes
     return to_bytes(torch.where(shown, torch.cat([rgb / alpha.clamp(min=0.5 / 255), alpha], dim=-1), 0.0))
 
 
 def save_png(path: Path, picture: UInt8[Tensor, "height width *channels"]) -> None:
-    """Write a picture, gray, RGB, or RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
+    """Write a gray, RGB or straight RGBA picture as PNG, whole or not at all. Missing folders are created."""
     with whole_file(path) as part:
         Image.fromarray(picture.numpy()).save(part, format="PNG")
 
 
 def color_map(values: Float[Tensor, "height width"], low: float, high: float) -> Float[Tensor, "height width 3"]:
-    """Return colors, dark at `low` and bright at `high`, perceptually uniform between (matplotlib's magma).
+    """Return colors, dark at `low` and bright at `high`, perceptually uniform in between (matplotlib's magma).
 
-    `low` may exceed `high`: `color_map(depth, far, near)` shows what is near as bright. Values outside the
-    range take its end colors; NaN takes the color of `low`.
+    `low` may exceed `high`: `color_map(depth, far, near)` shows near as bright. Values outside the range take its end
+    colors; NaN takes the color of `low`.
     """
     span = high - low if high != low else 1.0
     place = torch.nan_to_num((values.detach().float().cpu() - low) / span, nan=0.0).clamp(0, 1)
@@ -73,7 +73,7 @@ def color_map(values: Float[Tensor, "height width"], low: float, high: float) ->
 
 
 def side_by_side(pictures: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int = 4) -> UInt8[Tensor, "height width 3"]:
-    """Return pictures in one row, `gap` white pixels between them; shorter ones stand at the bottom."""
+    """Return pictures in one row, with `gap` white pixels in between; shorter ones are aligned at the bottom."""
     height = max(picture.shape[0] for picture in pictures)
     width = sum(picture.shape[1] for picture in pictures) + gap * (len(pictures) - 1)
     row = torch.full((height, width, 3), PAPER, dtype=torch.uint8)
@@ -87,8 +87,8 @@ def side_by_side(pictures: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int = 4) -> UI
 def visible_range(depth: Float[Tensor, "height width"], opacity: Float[Tensor, "height width"]) -> tuple[float, float]:
     """Return near and far (scene units) of what is visible: opacity above one half.
 
-    The outer 2 % at each end are left out, so that a few stray points do not take the scale. Where nothing is
-    visible it is the range of the whole picture. Of a large picture some of the rows and columns are looked at.
+    The outer 2 % at each end are left out, so that a few stray points do not dominate the scale. If nothing is visible,
+    it is the range of the whole picture. For a large picture only some rows and columns are used.
     """
     every = max(1, math.isqrt(depth.numel() // ENOUGH_PIXELS))
     depth, opacity = (each[::every, ::every] for each in (depth, opacity))
@@ -107,7 +107,7 @@ def depth_picture(
 ) -> UInt8[Tensor, "height wider 3"]:
     """Return depth in colors, near bright, with its scale on the right.
 
-    Where `opacity` is given, what light passes through fades to pale gray.
+    If `opacity` is given, colors fade to pale gray where light passes through.
     """
     picture = torch.empty(*depth.shape, 3, dtype=torch.uint8)
     for rows in row_chunks(*depth.shape):
@@ -141,7 +141,7 @@ def panels(
     depth: Float[Tensor, "height width"],
     opacity: Float[Tensor, "height width"],
 ) -> Iterator[tuple[str, UInt8[Tensor, "height wider 3"]]]:
-    """Yield truth, render, depth and error with their names, one after the other: a large one takes much memory."""
+    """Yield truth, render, depth and error with their names, one after another: a large one takes much memory."""
     yield "truth", to_bytes(truth)
     yield "render", to_bytes(render)
     yield "depth", depth_picture(depth, *visible_range(depth, opacity), opacity)
@@ -149,21 +149,21 @@ def panels(
 
 
 def mosaic(named: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> UInt8[Tensor, "taller wider 3"]:
-    """Return panels in a row, a caption above each; large ones are shrunk (`at_most`)."""
+    """Return panels in a row, with a caption above each; large ones are shrunk (`at_most`)."""
     small = [(name, at_most(panel)) for name, panel in named]
     size = letter_size(small[0][1].shape[0])
     return framed(side_by_side([with_caption(panel, name, size) for name, panel in small], gap=size), size)
 
 
 def framed(picture: UInt8[Tensor, "height width 3"], size: int) -> UInt8[Tensor, "taller wider 3"]:
-    """Return the picture with half of `size` of white around it."""
+    """Return the picture with a white border of half of `size`."""
     return torch.nn.functional.pad(picture, (0, 0, *(4 * [size // 2])), value=PAPER)
 
 
 def at_most(
     picture: UInt8[Tensor, "height width 3"], longest: int = LONGEST_PANEL
 ) -> UInt8[Tensor, "small_height small_width 3"]:
-    """Return the picture, shrunk to half, a third, ... by means over squares where a side is longer than `longest`."""
+    """Return the picture, shrunk to half, a third, ... by means over squares if a side is longer than `longest`."""
     by = -(-max(picture.shape[:2]) // longest)
     if by == 1:
         return picture
@@ -172,19 +172,19 @@ def at_most(
 
 @cache
 def _colors() -> Float[Tensor, "256 3"]:
-    # Only here: the other pictures can do without matplotlib, which is slow to import.
+    # Only here: other pictures do not need matplotlib, which is slow to import.
     from matplotlib import colormaps
 
     return torch.tensor(colormaps["magma"](np.arange(256))[:, :3], dtype=torch.float32)
 
 
 def letter_size(height: int) -> int:
-    """Return a size of type (pixels), legible beside a small picture and not loud beside a large one."""
+    """Return a font size (pixels), legible next to a small picture and unobtrusive next to a large one."""
     return max(10, round(0.03 * height))
 
 
 def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int) -> UInt8[Tensor, "taller wider 3"]:
-    """Return the picture under a line of text, in letters of `size` pixels."""
+    """Return the picture under a line of text with a font size of `size` pixels."""
     font, text = ImageFont.load_default(size), for_terminal(text)
     height, width, _ = picture.shape
     top = round(1.5 * size)
@@ -195,7 +195,7 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
 
 
 def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
-    """Set a slim color bar at the picture's right, from bright at `top` down to dark, with both numbers."""
+    """Add a slim color bar on the picture's right, from bright at `top` down to dark, with both numbers."""
     height = picture.shape[0]
     size = letter_size(height)
     font = ImageFont.load_default(size)

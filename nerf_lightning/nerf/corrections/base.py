@@ -1,4 +1,4 @@
-"""The contract of a correction: what a photograph made of the light that reached its camera."""
+"""The contract of a correction: how a photograph changed the light that reached its camera."""
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -15,18 +15,18 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Correction(Part, ABC):
-    """Map the colors that a model renders to those that a photograph shows of them.
+    """Map the colors that a model renders to those that a photograph shows.
 
-    A step of training applies it after compositing and before the loss, so that the model need not explain what
-    differs from photograph to photograph. Nothing else does: validation, evaluation, films, exports and the viewer show
-    the model's own, neutral colors. As it begins, it changes no bit.
+    A training step applies it after compositing and before the loss, so that the model need not explain what differs
+    between photographs. Nothing else applies it: validation, evaluation, films, exports and the viewer show the model's
+    own, neutral colors. Initially it changes no bit.
     """
 
     def fit_to(self, scene: SceneRecord) -> None:
-        """Take note of the photographs, once, before training.
+        """Record the photographs, once, before training.
 
         Raises:
-            InputError: a single one trains, whose colors differ from none.
+            InputError: there is only one training photograph, so no colors differ.
         """
         if len(scene.splits["train"]) < 2:
             raise InputError(
@@ -35,13 +35,13 @@ class Correction(Part, ABC):
             )
 
     def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
-        """Return a rendering whose colors are those that photographs show.
+        """Return a rendering with the colors that photographs show.
 
-        The scene's own light reached the camera. The background behind it did not: it looks the same to all.
+        The scene's own light reached the camera. The background did not: it looks the same in all.
 
         Args:
             rendering: of one ray for each pixel.
-            pixels: where in which photograph each ray stands.
+            pixels: the photograph and pixel of each ray.
         """
         light = rendering.rgb, rendering.foreground, rendering.opacity
         return replace(rendering, rgb=in_other_light(lambda straight: self(straight, pixels), *light))
@@ -51,20 +51,20 @@ class Correction(Part, ABC):
         """Return what photographs show of rendered colors.
 
         Args:
-            rgb: sRGB-encoded, composited; in [0, 1] or somewhat beyond. So is what comes out, without a clamp.
-            pixels: where in which photograph each color stands.
+            rgb: sRGB-encoded, composited; in [0, 1] or somewhat beyond. The output is the same, not clamped.
+            pixels: the photograph and pixel of each color.
         """
 
     def neutral(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"] | None:
-        """Return the neutral colors of what photographs show, the inverse of `forward`; None: it is not known.
+        """Return the neutral colors of what photographs show, the inverse of `forward`; None: unknown.
 
-        Splats are fitted to such photographs.
+        Splats are fitted to photographs with neutral colors.
         """
         return None
 
 
 class NoCorrection(Correction):
-    """Leave every color as it is: photographs show what there is."""
+    """Leave every color unchanged."""
 
     def fit_to(self, scene: SceneRecord) -> None:
         """Take any scene."""

@@ -1,4 +1,4 @@
-"""Photographs that were exposed differently, under different white balance."""
+"""Photographs with different exposure and white balance."""
 
 import torch
 from jaxtyping import Float
@@ -12,12 +12,12 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Exposure(Correction):
-    """Per photograph one exposure, and the gains of red and blue against it, all in stops of linear light.
+    """One exposure per photograph, and the gains of red and blue relative to it, all in stops of linear light.
 
     The exposure is the mean of the three channels: green gains what red and blue lose.
 
-    The light of all photographs can be scaled together, and the model's the other way: a penalty on the three means
-    over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
+    The light of all photographs can be scaled together, and the model's inversely: a penalty on the three means over
+    the training photographs keeps them near zero, so that the neutral picture is exposed like the mean photograph.
 
     Args:
         learning_rate: learning rate of the exposures, in stops; Adam changes each by at most about this per step.
@@ -31,14 +31,14 @@ class Exposure(Correction):
         require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "mean_weight": (0.0, 1e6)})
         self.learning_rate, self.mean_weight = learning_rate, mean_weight
         self.stops = nn.Parameter(torch.zeros(1, 3))
-        """Of each view: exposure, red, blue."""
+        """Exposure, red and blue of each view."""
         self.register_buffer("trained", torch.zeros(1, dtype=torch.int64), persistent=False)
 
     def fit_to(self, scene: SceneRecord) -> None:
-        """Make room for each photograph.
+        """Allocate parameters for each photograph.
 
         Raises:
-            InputError: there is but one.
+            InputError: there is only one.
         """
         super().fit_to(scene)
         self.stops = nn.Parameter(torch.zeros(len(scene.view_names), 3))
@@ -58,9 +58,9 @@ class Exposure(Correction):
         return torch.exp2(torch.stack([exposure + red, exposure - red - blue, exposure + blue], dim=-1))
 
     def penalty(self) -> Float[Tensor, ""]:
-        """Return the sum of the squared means of exposure, red and blue over the photographs that train."""
+        """Return `mean_weight` times the sum of squared means of the three stops over the training photographs."""
         return self.mean_weight * self.stops[self.trained].mean(dim=0).square().sum()
 
     def reset_parameters(self) -> None:
-        """Begin with photographs that are all alike."""
+        """Reset all exposures to zero."""
         nn.init.zeros_(self.stops)

@@ -15,9 +15,9 @@ class Encoder(Part, ABC):
 
     in_dim: int = 3
     needs_unit_cube: bool = False
-    """True where points outside of the unit cube mean nothing; the field must map its positions there."""
+    """True if points outside the unit cube are meaningless; the field must map its positions into it."""
     matmul_precision: MatmulPrecision = "float32"
-    """The precision of the products with the encoder's matrices, where it has any; its field sets it."""
+    """The precision of the products with the encoder's matrices, if it has any; its field sets it."""
 
     @property
     @abstractmethod
@@ -31,36 +31,36 @@ class Encoder(Part, ABC):
     def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:
-        """Return the features of points, with gradients, where they have been computed without them before."""
+        """Return known features of points, computed before without gradients, with gradients attached."""
         return self(points)
 
     def tables(self) -> list[nn.Parameter]:
-        """Return those of its own parameters that are tables to look up in, not matrices to multiply with.
+        """Return the encoder's parameters that are lookup tables, not matrices to multiply with.
 
-        Their gradients are all but zero in most rows, and they do not decay.
+        Their gradients are zero in most rows, and they do not decay.
         """
         return []
 
     def grid(self) -> tuple[Float[Tensor, "entries features"], HashGridLayout] | None:
-        """Return the table and its layout where the features are those of one hash grid and nothing else; else None."""
+        """Return the table and its layout if the features are exactly those of one hash grid; else None."""
         return None
 
     @abstractmethod
     def reset_parameters(self) -> None:
-        """Draw the parameters anew from torch's generator; nothing to do where there are none."""
+        """Reinitialize the parameters from torch's generator, if there are any."""
 
 
 class ConeEncoder(Encoder):
-    """An encoder that may look at the cone of a point's pixel (`geometry.cones`), in the coordinates of the points."""
+    """An encoder that may use the cone of a point's pixel (`geometry.cones`), in the coordinates of the points."""
 
     sees_cones: bool
-    """Whether it does; else it need not be given any."""
+    """Whether it does; else it needs no cones."""
 
     @abstractmethod
     def forward(
         self, points: Float[Tensor, "*points 3"], covariance: Float[Tensor, "*points 6"] | None = None
     ) -> Float[Tensor, "*points features"]:
-        """Return the features; without a covariance those of the points themselves, as if it were 0."""
+        """Return the features; without a covariance, those of the points themselves, as if it were 0."""
 
     @abstractmethod
     def attach_gradients(
@@ -69,14 +69,14 @@ class ConeEncoder(Encoder):
         features: Float[Tensor, "*points features"],
         covariance: Float[Tensor, "*points 6"] | None = None,
     ) -> Float[Tensor, "*points features"]:
-        """Return the features of points, with gradients, where they have been computed without them before."""
+        """Return known features of points, computed before without gradients, with gradients attached."""
 
 
 def require_direction_encoder(encoder: Encoder) -> None:
-    """Refuse an encoder that means nothing to directions.
+    """Refuse an encoder that cannot encode directions.
 
     Raises:
-        ValueError: it wants points of the unit cube.
+        ValueError: it needs points in the unit cube.
     """
     if encoder.needs_unit_cube:
         raise ValueError(f"{type(encoder).__name__} cannot encode directions: directions do not lie in the unit cube")
@@ -89,6 +89,6 @@ def tables_of(model: nn.Module) -> list[nn.Parameter]:
 
 
 def matrices_of(model: nn.Module) -> list[nn.Parameter]:
-    """Return the matrices that features are multiplied with: a model's parameters with two sides that are no tables."""
+    """Return the matrices that multiply features: a model's two-dimensional parameters, except tables."""
     tables = set(map(id, tables_of(model)))
     return [weight for weight in model.parameters() if weight.ndim == 2 and id(weight) not in tables]

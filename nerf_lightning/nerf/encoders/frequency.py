@@ -10,14 +10,14 @@ from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.ranges import require_ranges
 
 MOST_FREQUENCIES = 64
-"""Of higher ones float32 has no digits, and at last no numbers."""
+"""Higher ones lose all digits in float32, and finally overflow."""
 
 
 class FrequencyEncoder(Encoder):
     """gamma(x) = (x, sin(2^0 x), cos(2^0 x), ..., sin(2^(L-1) x), cos(2^(L-1) x)), Eq. 4 of arXiv 2003.08934.
 
-    The paper writes a factor pi inside the sines, its released code has none; without it a scene of a few units
-    fits into one period of the lowest frequency. L = 10 for positions and 4 for directions.
+    The paper has a factor pi inside the sines, its released code does not; without it a scene of a few units fits into
+    one period of the lowest frequency. L = 10 for positions and 4 for directions.
 
     Args:
         num_frequencies: L, the number of octaves.
@@ -36,7 +36,7 @@ class FrequencyEncoder(Encoder):
 
     @property
     def out_dim(self) -> int:
-        """3 (2 L + 1) with the input, 6 L without."""
+        """Return 3 (2 L + 1) with the input, 6 L without."""
         return self.in_dim * (2 * self.frequencies.numel() + int(self.include_input))
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
@@ -46,4 +46,4 @@ class FrequencyEncoder(Encoder):
         return torch.cat([points, waves], dim=-1) if self.include_input else waves
 
     def reset_parameters(self) -> None:
-        """Nothing is learned here."""
+        """Do nothing: there are no parameters."""

@@ -20,18 +20,19 @@ INITIAL_RANGE = 1e-4
 BYTES_PER_PARAMETER = 16
 MOST_LEVELS = 64
 FINEST = 1 << 24
-"""Cells that float32 tells apart."""
+"""Number of cells that float32 can distinguish."""
 
 
 class HashGridEncoder(Encoder):
-    """Concatenate the features that trilinear interpolation finds in grids of growing resolution.
+    """Concatenate features interpolated trilinearly in grids of growing resolution.
 
-    Points lie in the unit cube; a field that maps its positions there is needed (`field=ngp`). A level whose
-    vertices fit into its table is dense; a finer one shares entries by a hash, and training sorts out the collisions.
+    Points are in the unit cube, so a field that maps its positions there is needed (`field=ngp`). A level whose
+    vertices fit into its table is dense; a finer one shares entries through a hash, and training resolves the
+    collisions.
 
-    Finer levels may be blended in one after the other, from coarse to fine, over a first share of the run (Sec. 3.3,
-    arXiv 2104.06405; for hash grids Heo et al., ICML 2023): until then the scene is smooth, in which cameras find their
-    place, and geometry its rough shape. Levels that are not on yet are not computed.
+    Finer levels may be blended in one after another, from coarse to fine, over the first share of the run (Sec. 3.3,
+    arXiv 2104.06405; for hash grids Heo et al., ICML 2023): until then the scene is smooth, which helps cameras find
+    their place and geometry its rough shape. Levels that are not on yet are not computed.
 
     Args:
         num_levels: number of grids.
@@ -65,9 +66,9 @@ class HashGridEncoder(Encoder):
         require_ranges(locals(), {"log2_table_size": (1, 30), "max_resolution": (1, FINEST), "blend_in": (0.0, 1.0)})
         self.layout = hash_grid_layout(num_levels, log2_table_size, min_resolution, max_resolution)
         self.features_per_level, self.blend_in = features_per_level, blend_in
-        self._weights = [1.0] * num_levels  # as in the buffer, which is not read at each step
+        self._weights = [1.0] * num_levels  # mirrors the buffer, which is not read at each step
         if blend_in:
-            # In the checkpoint, so that its pictures are made as the last step was.
+            # In the checkpoint, so that it renders as the last step did.
             self.register_buffer("level_weights", torch.ones(num_levels))
         _require_memory(self.layout.offsets[-1] * features_per_level)
         self.table = nn.Parameter(torch.empty(self.layout.offsets[-1], features_per_level))
@@ -75,7 +76,7 @@ class HashGridEncoder(Encoder):
 
     @property
     def out_dim(self) -> int:
-        """Levels times features."""
+        """Number of levels times features per level."""
         return len(self.layout.resolutions) * self.features_per_level
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
@@ -83,7 +84,7 @@ class HashGridEncoder(Encoder):
         return self._interpolate(points, None)
 
     def tables(self) -> list[nn.Parameter]:
-        """Return the one table, in which all levels lie."""
+        """Return the single table that holds all levels."""
         return [self.table]
 
     def grid(self) -> tuple[Tensor, HashGridLayout] | None:
@@ -93,25 +94,25 @@ class HashGridEncoder(Encoder):
     def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:
-        """Return the features of points, with gradients, where they have been computed without them before."""
-        # While levels are blended in they are computed again: what is known has been weighted.
+        """Return known features of points, computed before without gradients, with gradients attached."""
+        # While levels are blended in they are computed again: the known features are weighted.
         return self._interpolate(points, None if self._blends else features.reshape(-1, self.out_dim))
 
     @property
     def replays(self) -> bool:  # type: ignore[override]
-        """Whether no levels are blended in."""
+        """Whether blending is off."""
         return not self.blend_in
 
     def on_step(self, context: StepContext) -> None:
-        """Blend the levels in that are due: level l (from 0) rises over the l-th part of `blend_in`."""
+        """Update the blending weights: level l (from 0) rises over the l-th part of `blend_in`."""
         if self.blend_in:
             self._set_weights(blending_weights(len(self.layout.resolutions), context.progress / self.blend_in))
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: weights of levels that are none.
+            InputError: invalid level weights.
         """
         if self.blend_in:
             weights = self.level_weights.tolist()
@@ -139,14 +140,14 @@ class HashGridEncoder(Encoder):
         return features.view(*points.shape[:-1], self.out_dim)
 
     def reset_parameters(self) -> None:
-        """Draw the tables anew: uniform within 1e-4, as the paper has it."""
+        """Reinitialize the tables, uniform in [-1e-4, 1e-4] as in the paper."""
         nn.init.uniform_(self.table, -INITIAL_RANGE, INITIAL_RANGE)
 
 
 def blending_weights(num_levels: int, share: float) -> list[float]:
     """Return the weight of each level, coarsest first, `share` of the way from the coarsest alone to all of them.
 
-    w_l = (1 - cos(pi a)) / 2 with a = share (L - 1) - (l - 1), held within 0 and 1 (Eq. 14, arXiv 2104.06405).
+    w_l = (1 - cos(pi a)) / 2 with a = share (L - 1) - (l - 1), clamped to [0, 1] (Eq. 14, arXiv 2104.06405).
 
     >>> [[round(weight, 3) for weight in blending_weights(3, share)] for share in (0.0, 0.75, 1.0)]
     [[1.0, 0.0, 0.0], [1.0, 1.0, 0.5], [1.0, 1.0, 1.0]]

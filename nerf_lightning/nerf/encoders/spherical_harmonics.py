@@ -37,7 +37,7 @@ class SphericalHarmonicsEncoder(Encoder):
         return spherical_harmonics(points, self.degree)
 
     def reset_parameters(self) -> None:
-        """Nothing is learned here."""
+        """Do nothing: there are no parameters."""
 
 
 @with_kernel("spherical_harmonics.cuda")
@@ -52,7 +52,7 @@ def spherical_harmonics(points: Float[Tensor, "*points 3"], degree: int) -> Floa
         columns += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
     if degree > 3:
         columns += _degree_4(x, y, z)
-    return torch.stack(columns).movedim(0, -1).contiguous()  # written in one go, then turned: twice as fast
+    return torch.stack(columns).movedim(0, -1).contiguous()  # stacked contiguously, then transposed: twice as fast
 
 
 def _degree_4(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:

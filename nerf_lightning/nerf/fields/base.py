@@ -15,35 +15,35 @@ from nerf_lightning.nerf.types.renderings import FieldOutput
 
 @dataclass(frozen=True)
 class HiddenLayer:
-    """Neurons that a field could do without, by the names that its state has for what makes and what reads them."""
+    """Neurons that could be pruned, given by the state names of the tensors that produce and read them."""
 
     rows: tuple[str, ...]
-    """What has an entry for each neuron along its first axis; the matrix that makes them comes first, and
-    then its bias, if it has one."""
+    """Tensors with an entry for each neuron along the first axis: first the matrix that produces them, then its bias,
+    if it has one."""
     columns: tuple[str, ...]
-    """Matrices whose first columns read them, one each; columns that read something else follow."""
+    """Matrices whose first columns read the neurons, one column each; columns that read something else follow."""
 
 
 class Field(Part, ABC):
-    """A radiance field: it answers what is asked of points (`types.points`)."""
+    """A radiance field: density and color at points (`types.points`)."""
 
     sees_cones: bool = False
-    """True where the result depends on the pixels' cones (`Points.covariance`)."""
+    """True if the result depends on the pixels' cones (`Points.covariance`)."""
 
     compiles: bool = True
-    """False where kernels of our own do most of the work, which torch.compile cannot see into."""
+    """False if this program's own kernels, which are opaque to torch.compile, do most of the work."""
 
     matmul_precision: MatmulPrecision = "float32"
     """The precision of the products with the field's weights, and of nothing else: layers are
-    `matmul_precision.Linear`, and kernels are given this. A field that does neither multiplies in float32 everywhere,
-    which is slow and right."""
+    `matmul_precision.Linear`, and kernels receive this. A field that does neither multiplies in float32 everywhere,
+    which is slow and correct."""
 
     @abstractmethod
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
-        """Return the density per unit length, without paying for color.
+        """Return the density per unit length, without computing color.
 
         Returns:
-            The density; and features that spare `forward` what was computed here, None where it has no use for them.
+            The density, and features that `forward` can reuse, None if it cannot use any.
         """
 
     @abstractmethod
@@ -52,22 +52,22 @@ class Field(Part, ABC):
 
         Args:
             points: with directions.
-            features: what `density` returned for the same points, with or without gradients; None: nothing was asked
-                before. What comes out is the same, and its gradients too.
+            features: what `density` returned for the same points, with or without gradients; None: not computed yet.
+                The result and its gradients are the same either way.
         """
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the layers that a narrower field of this kind, with another `width`, would have fewer neurons in."""
+        """Return the layers that have fewer neurons in a field of this kind with a smaller `width`."""
         return []
 
     def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
-        """Return what the neurons of `hidden_layers` come to at points with directions, layer by layer."""
+        """Return the activations of `hidden_layers` at points with directions, layer by layer."""
         return []
 
     def parts(self) -> FieldParts | None:
-        """Return what kernels need that render whole rays by themselves; None where the field is of another kind."""
+        """Return what whole-ray kernels need; None if they do not support the field."""
         return None
 
     @abstractmethod
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
+        """Reinitialize every parameter from torch's generator."""

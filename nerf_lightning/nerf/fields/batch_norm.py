@@ -1,4 +1,4 @@
-"""Batch normalization (arXiv 1502.03167) with Keras's constants, as the article's network can have it."""
+"""Batch normalization (arXiv 1502.03167) with Keras's constants, an option of the article's network."""
 
 import torch
 from jaxtyping import Float
@@ -15,12 +15,12 @@ EPSILON = 1e-3
 class BatchNorm(Part):
     """Normalize each neuron over all samples of a step: gamma (x - mean) / sqrt(variance + epsilon) + beta.
 
-    Outside of training, mean and variance are running means over the steps that were taken. If a step asks several
-    times, they follow the last.
+    Outside training, mean and variance are running means over the training steps. If a step calls the layer several
+    times, the last call counts.
     """
 
     couples_rays = True
-    replays = False  # a step writes `batch_mean` and `batch_variance`, which are no counts
+    replays = False  # a step writes `batch_mean` and `batch_variance`, which are not counts
 
     weight: Tensor
     bias: Tensor
@@ -48,14 +48,14 @@ class BatchNorm(Part):
         return functional.batch_norm(rows, None, None, self.weight, self.bias, training=True, eps=EPSILON)
 
     def after_step(self, rgb: Tensor, target: Tensor, weight: Tensor) -> None:
-        """Let the running means follow the step's."""
-        # On devices whose guard does not wait, a step that is not finite comes here, too.
+        """Update the running means with the step's."""
+        # On devices whose guard does not wait, nonfinite steps get here, too.
         finite = self.batch_mean.isfinite().all() & self.batch_variance.isfinite().all()
         for running, batch in ((self.running_mean, self.batch_mean), (self.running_variance, self.batch_variance)):
             running.lerp_(torch.where(finite, batch, running), 1.0 - MOMENTUM)
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
             InputError: a negative variance.
@@ -66,7 +66,7 @@ class BatchNorm(Part):
             )
 
     def reset_parameters(self) -> None:
-        """Forget what was learned."""
+        """Reset everything that was learned."""
         for one in (self.weight, self.running_variance):
             nn.init.ones_(one)
         for zero in (self.bias, self.running_mean):

@@ -87,24 +87,24 @@ class NerfMLP(Field):
         self.reset_parameters()
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the scene's space and box."""
+        """Record the scene's space and box."""
         self.contracted.fit_to(scene)
         self.aabb.copy_(scene.aabb)
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: a box without inside.
+            InputError: an empty box.
         """
         require_box(self.aabb)
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], None]:
-        """Return the density per unit length, without paying for color."""
+        """Return the density per unit length, without computing color."""
         return self._activate(_exactly(self.density_head, self._trunk(points.positions))[..., 0], None), None
 
     def forward(self, points: Points, features: Tensor | None = None) -> FieldOutput:
-        """Return density and color; density does not depend on the direction. There are no features."""
+        """Return density and color; density does not depend on the direction. `features` is unused."""
         hidden = self._trunk(points.positions)
         raw_density = _exactly(self.density_head, hidden)[..., 0]
         feature = self.color_feature(hidden, points)
@@ -120,11 +120,11 @@ class NerfMLP(Field):
         return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
 
     def color_feature(self, hidden: Float[Tensor, "*points width"], points: Points) -> Float[Tensor, "*points width"]:
-        """Return what the color is made of besides the direction; a field that follows this one may add to it."""
+        """Return the color's input besides the direction; a derived field may add to it."""
         return self.feature(hidden)
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the layers of the trunk, the feature and the color's; encodings that join them stand behind them."""
+        """Return the layers of the trunk, the feature and the color; encodings that join them come after them."""
         following = ((f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk)))
         readers = (*following, ("density_head.weight", "feature.weight"))
         trunk = [HiddenLayer(self._rows(f"trunk.{number}"), each) for number, each in enumerate(readers)]
@@ -132,7 +132,7 @@ class NerfMLP(Field):
         return [*trunk, feature, HiddenLayer(self._rows("color_hidden"), ("color_head.weight",))]
 
     def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
-        """Return what the neurons of `hidden_layers` come to, layer by layer."""
+        """Return the activations of `hidden_layers`, layer by layer."""
         found: list[Tensor] = []
         layers = (*self.trunk, self.feature, self.color_hidden)
         hooks = [layer.register_forward_hook(lambda _, inputs, output: found.append(output)) for layer in layers]
@@ -144,7 +144,7 @@ class NerfMLP(Field):
         return found
 
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
+        """Reinitialize every parameter from torch's generator."""
         self.position_encoder.reset_parameters()
         self.direction_encoder.reset_parameters()
         for module in self.modules():
@@ -163,7 +163,7 @@ class NerfMLP(Field):
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
             positions = contract(in_unit_ball(positions, self.aabb))
-        # As rows: torch multiplies these anyway, and a ReLU in place on a view of them would copy its gradients.
+        # As rows: torch multiplies rows anyway, and an in-place ReLU on a view of them would copy its gradients.
         encoded = self.position_encoder(positions.reshape(-1, 3))
         hidden = encoded
         for index, layer in enumerate(self.trunk):
@@ -173,7 +173,7 @@ class NerfMLP(Field):
         return hidden.view(*positions.shape[:-1], hidden.shape[-1])
 
     def _activate(self, raw: Tensor, noise: Tensor | None) -> Tensor:
-        # Densities multiply lengths of 1e-3 and enter exponentials: always in float32.
+        # Densities are multiplied by lengths of 1e-3 and enter exponentials: always float32.
         raw = raw.float() + self.density_bias
         if noise is not None:
             raw = raw + noise
@@ -181,7 +181,7 @@ class NerfMLP(Field):
 
 
 def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
-    # With so few outputs float32 costs nothing, and a density or a color keeps the digits that it has.
+    # With so few outputs float32 costs nothing, and densities and colors keep their digits.
     return linear(features, head.weight, head.bias, "float32")
 
 

@@ -1,4 +1,4 @@
-"""Two small MLPs behind an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989)."""
+"""Two small MLPs on top of an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989)."""
 
 from itertools import pairwise
 from typing import Any
@@ -27,10 +27,10 @@ THICK, THIN = 3.0, -1.0
 
 
 class NGPField(Field):
-    """Density from one hidden layer, color from more that see the direction; exponential density.
+    """Density from an MLP with one hidden layer, color from one that sees the direction; exponential density.
 
-    Positions are mapped from the scene's box, or from contracted space, to the unit cube. Outside of the box (without
-    contraction) there is nothing.
+    Positions are mapped from the scene's box, or from contracted space, to the unit cube. Without contraction, space
+    outside the box is empty.
 
     Args:
         position_encoder: features of points in the unit cube.
@@ -80,7 +80,7 @@ class NGPField(Field):
         self.density_bias = density_bias
         self.least_slope = 0.0
         self.contracted = Contracted(contraction)
-        # Reading the buffer stops a GPU, so it is read once.
+        # Reading the buffer stalls a GPU, so it is read once.
         self._known_bias: float | None = None
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -93,10 +93,10 @@ class NGPField(Field):
         self.reset_parameters()
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the box that holds the scene's content, whether the photographs have alpha, and how many train.
+        """Record the box of the scene's content, whether the photographs have alpha, and how many are trained on.
 
         Raises:
-            InputError: a code is asked for, and there is but one photograph.
+            InputError: an appearance embedding was requested, but there is only one photograph.
         """
         self.aabb.copy_(scene.aabb)
         self.contracted.fit_to(scene)
@@ -114,10 +114,10 @@ class NGPField(Field):
         self._known_bias = None
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: a box without inside, or codes of views that there are none of.
+            InputError: an empty box, or embeddings of views that do not exist.
         """
         require_box(self.aabb)
         if self.appearance and not bool(((self.trained >= 0) & (self.trained < len(self.codes))).all()):
@@ -138,7 +138,7 @@ class NGPField(Field):
         return FieldOutput(density=density, rgb=rgb)
 
     def hidden_layers(self) -> list[HiddenLayer]:
-        """Return the one layer of the density's MLP, and those of the color's."""
+        """Return the hidden layers of the density's MLP and of the color's."""
         sizes = {"density_mlp": len(self.density_mlp), "color_mlp": len(self.color_mlp)}
         return [
             HiddenLayer((f"{name}.{number}",), (f"{name}.{number + 1}",))
@@ -147,17 +147,17 @@ class NGPField(Field):
         ]
 
     def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
-        """Return what the neurons of `hidden_layers` come to, layer by layer."""
+        """Return the activations of `hidden_layers`, layer by layer."""
         *density, features = _layer_by_layer(self.density_mlp, self._encoded(points, None))
         return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
-        """Return what kernels of whole rays compute with; None while the encoder does not look up a grid alone.
+        """Return what whole-ray kernels compute with; None unless the encoder is exactly a grid lookup.
 
-        Where hooks want to see what the field is asked, nothing passes it by.
+        With hooks on the field it is also None, so that they see every call.
         """
         grid, hooks = self.position_encoder.grid(), (*self._forward_hooks, *self._forward_pre_hooks)
-        if grid is None or hooks or type(self) is not NGPField:  # a class of another name may compute something else
+        if grid is None or hooks or type(self) is not NGPField:  # a subclass may compute something else
             return None
         if self._known_bias is None:
             self._known_bias = float(self.bias)
@@ -174,7 +174,7 @@ class NGPField(Field):
         )
 
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
+        """Reinitialize every parameter from torch's generator."""
         self.position_encoder.reset_parameters()
         self.direction_encoder.reset_parameters()
         for weight in (*self.density_mlp, *self.color_mlp):
@@ -183,12 +183,12 @@ class NGPField(Field):
             nn.init.zeros_(self.codes)
 
     def _with_direction(self, features: Tensor, points: Points) -> Tensor:
-        """Return what the color is made of: what the density's MLP hands over, the direction, and the code."""
+        """Return the color MLP's input: the density MLP's features, the direction, and the appearance embedding."""
         shared = self._shared_along(points).to(features.dtype)
         return torch.cat([features, shared.expand(*features.shape[:-1], shared.shape[-1])], dim=-1)
 
     def _shared_along(self, points: Points) -> Float[Tensor, "*#points features"]:
-        """Return what all samples of a ray share: the features of the direction, and the code."""
+        """Return what all samples of a ray share: the features of the direction, and the appearance embedding."""
         direction = self.direction_encoder(points.directions)
         if not self.appearance:
             return direction
@@ -199,7 +199,7 @@ class NGPField(Field):
         return self.codes[self.trained].mean(dim=0) if points.photograph is None else self.codes[points.photograph]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # As many photographs as the checkpoint's run had, which a field that is newly built does not know.
+        # As many photographs as the checkpoint's run had, which a newly built field does not know.
         codes, trained = state_dict.get(f"{prefix}codes"), state_dict.get(f"{prefix}trained")
         if codes is not None and trained is not None and codes.shape[1:] == (self.appearance,) and trained.ndim == 1:
             self.codes.data = self.codes.new_zeros(len(codes), self.appearance)
@@ -246,7 +246,7 @@ def _weights(*sizes: int) -> nn.ParameterList:
 
 
 def _layer_by_layer(weights: nn.ParameterList, features: Tensor) -> list[Tensor]:
-    """Return what `kernels.mlp` computes, with all that lies between its ends."""
+    """Return what `kernels.mlp` computes, with all intermediate layers."""
     layers = []
     for number, weight in enumerate(weights):
         features = linear(features if not number else functional.relu(features), weight, None, "float32")

@@ -1,4 +1,4 @@
-"""Two sets of poses of the same cameras, each in a frame and scale of its own: the similarity between them."""
+"""The similarity between two sets of poses of the same cameras, each in its own frame and scale."""
 
 import torch
 from jaxtyping import Float
@@ -8,15 +8,15 @@ from nerf_lightning.nerf.geometry.world_frame import poses_from_user, similarity
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LEAST_SPREAD = 1e-6
-"""Of the cameras' centers, as a share of their distance from the origin; below it they stand in one place."""
+"""Minimum spread of the cameras' centers, as a share of their distance from the origin; below it they coincide."""
 
 
 @disable_autocast
 def similarity_between(one: Float[Tensor, "views 3 4"], other: Float[Tensor, "views 3 4"]) -> Float[Tensor, "4 4"]:
-    """Return the similarity that takes the poses of `one` to those of `other`, by least squares, in float64.
+    """Return the least-squares similarity that maps the poses of `one` to those of `other`, in float64.
 
-    Umeyama's solution (PAMI 1991, Eq. 40-43), in which the cameras' axes count beside their centers, as much as the
-    centers' spread: cameras that stand in a line, or two of them, leave no turn about that line open.
+    Umeyama's solution (PAMI 1991, Eq. 40-43), in which the cameras' axes count as well as their centers, as much as the
+    centers' spread: two cameras, or cameras in a line, leave no rotation about that line undetermined.
     """
     one, other = one.double(), other.double()
     middle, goal = one[:, :, 3].mean(dim=0), other[:, :, 3].mean(dim=0)
@@ -37,5 +37,5 @@ def similarity_between(one: Float[Tensor, "views 3 4"], other: Float[Tensor, "vi
 
 @disable_autocast
 def carried(c2w: Float[Tensor, "views 3 4"], by: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return where a similarity (float64) takes poses."""
+    """Return the poses mapped by a similarity (float64)."""
     return poses_from_user(c2w.double(), torch.linalg.inv(by)).to(c2w)

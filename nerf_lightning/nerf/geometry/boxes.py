@@ -1,4 +1,4 @@
-"""Boxes along the axes of the world, and the contraction of all space into a ball."""
+"""Axis-aligned boxes."""
 
 import torch
 from jaxtyping import Float
@@ -10,10 +10,10 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 
 def require_box(aabb: Float[Tensor, "2 3"]) -> None:
-    """Refuse a box from a file that has no inside.
+    """Refuse an empty box from a file.
 
     Raises:
-        InputError: a lower corner that is not below the upper one.
+        InputError: the lower corner is not below the upper one.
     """
     if not bool((aabb[0] < aabb[1]).all()):
         raise InputError(
@@ -43,8 +43,8 @@ def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Flo
 def distances_in_box(
     rays: RayBundle, aabb: Float[Tensor, "2 3"]
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
-    """Return where each ray enters and leaves a box, within its near and far; the first is not smaller on a miss."""
-    # A direction of exactly zero gives infinities, which order rightly; on a face they would give nan.
+    """Return where each ray enters and leaves a box, within its near and far; on a miss the first is not smaller."""
+    # Division by exactly zero gives infinities, which compare correctly, but NaN on a face.
     inverse = 1.0 / torch.where(rays.directions == 0, 1e-20, rays.directions)
     a, b = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
     enter = torch.minimum(a, b).amax(dim=-1)

@@ -1,7 +1,7 @@
-"""Cameras and their rays: pixels to rays, rays to pixels, focal lengths that follow the image's size.
+"""Cameras and their rays: pixels to rays, rays to pixels, and resizing.
 
 Letters: `c2w` camera-to-world, columns right, up, back, center. A camera looks along -z; pixel centers lie at +0.5.
-`plane` is a place in the image in focal lengths from the principal point, y down: ((x - cx) / fx, (y - cy) / fy).
+`plane` is a position in the image in focal lengths from the principal point, y down: ((x - cx) / fx, (y - cy) / fy).
 """
 
 import math
@@ -52,16 +52,16 @@ def pinhole_cameras(c2w: Float[Tensor, "views 3 4"], focal: float, width: int, h
 
 
 def vertical_field_of_view(cameras: Cameras, view: int) -> float:
-    """Return what the height of a view's picture takes in, in radians; of a panorama, what a person would look at."""
+    """Return the vertical field of view of a view, in radians; for a panorama, pi / 2."""
     if cameras.lens_model == "equirectangular":
         return 0.5 * math.pi
     return 2 * float(torch.atan(0.5 * cameras.height[view] / cameras.focal[view, 1]))
 
 
 def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, "*views"]) -> Cameras:
-    """Return the same cameras for images of another size: focal length and principal point follow the pixels.
+    """Return the same cameras for images of another size: focal length and principal point scale with the pixels.
 
-    The lens stays: its coefficients are for lengths in focal lengths.
+    The lens is unchanged: its coefficients are in focal lengths.
     """
     scale = torch.stack([width / cameras.width, height / cameras.height], dim=-1).to(cameras.focal)
     return replace(cameras, focal=cameras.focal * scale, center=cameras.center * scale, width=width, height=height)
@@ -79,17 +79,17 @@ def rays_through_pixels(
 ) -> RayBundle:
     """Return the rays through pixels; near and far are given per view (scene units).
 
-    The direction in camera axes is ((x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -1), undistorted by the lens where the
-    camera has one, rotated into the world and brought to unit length. Where the cameras say so, the ray is then bent
-    into normalized device coordinates, and near and far with it.
+    The direction in camera axes is ((x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -1), undistorted if the camera has a
+    lens, rotated into the world and normalized. If the cameras say so, the ray is then mapped to normalized device
+    coordinates, and near and far with it.
 
     Args:
         cameras: one per view.
-        pixels: which.
+        pixels: the pixels.
         near: where the rays of each view begin.
         far: where they end.
-        subpixel_offset: from the center of its pixel to where each ray passes, in pixels (x, y); None: none.
-        per_side: so many rays share each side of a pixel.
+        subpixel_offset: each ray's offset from the center of its pixel, in pixels (x, y); None: none.
+        per_side: number of rays along each side of a pixel.
     """
     view = pixels.view
     at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
@@ -112,15 +112,15 @@ def rays_through_pixels(
 def pixel_side(
     cameras: Cameras, view: Int[Tensor, "*rays"], directions: Float[Tensor, "*rays 3"]
 ) -> Float[Tensor, "*rays 2"]:
-    """Return the side of pixels at distance 0, and by how much it grows per unit of distance: the root of their areas.
+    """Return the side of pixels (the root of their area) at distance 0, and its growth per unit of distance.
 
     A pinhole's pixel takes the solid angle cos^3 / (f_x f_y); a lens that stretches its surroundings shows less in it.
-    In normalized device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
+    In normalized device coordinates, pixels seen from the middle of all cameras have the same size at all depths.
     Without gradients: the size of its pixels is no reason to move a camera.
 
     Args:
         cameras: all views.
-        view: of each pixel.
+        view: the view of each pixel.
         directions: of the pixels' centers in the lens's axes (right, down, forward), of any length.
     """
     pixel = 1.0 / cameras.focal[view]
@@ -137,7 +137,7 @@ def pixel_side(
 
 
 def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
-    """Return every pixel of one view as a picture of indices, shape (height, width), which takes no memory."""
+    """Return the indices of all pixels of one view, shape (height, width), which take no memory."""
     width, height = int(cameras.width[view]), int(cameras.height[view])
     across, down = (torch.arange(side, device=cameras.c2w.device) for side in (width, height))
     shape = (height, width)
@@ -145,14 +145,14 @@ def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
 
 
 def pixels_between(cameras: Cameras, view: int, part: slice) -> PixelIndex:
-    """Return some pixels of one view in a row, numbered row by row from 0."""
+    """Return a range of pixels of one view, numbered row by row from 0."""
     number = torch.arange(part.start, part.stop, device=cameras.c2w.device)
     width = int(cameras.width[view])
     return PixelIndex(view=torch.full_like(number, view), x=number % width, y=number // width)
 
 
 def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
-    """Return a coarse grid of pixels in every view, its corners and borders included, shape (views, pixels)."""
+    """Return a coarse grid of pixels in every view, including corners and borders, shape (views, pixels)."""
     share = torch.linspace(0.0, 1.0, per_side, dtype=torch.float64, device=cameras.c2w.device)
     across, down = torch.cartesian_prod(share, share).unbind(dim=-1)
     x, y = ((size - 1)[:, None] * part for size, part in ((cameras.width, across), (cameras.height, down)))
@@ -170,8 +170,8 @@ def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*poin
 def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 2"]:
     """Return where world points appear in one view, in pixels from the upper left corner (x, y).
 
-    Only points that the camera sees have a place: elsewhere (behind a pinhole, far outside the image of a lens that
-    folds back there) the formula gives a number that means nothing.
+    Only points that the camera sees have a position: elsewhere (behind a pinhole, far outside the image of a lens that
+    folds back there) the result is meaningless.
     """
     local = camera_coordinates(cameras, view, points)
     if cameras.lens_model == "pinhole":
@@ -184,9 +184,9 @@ def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> 
 def seen_at(
     cameras: Cameras, view: int, points: Float[Tensor, "points 3"]
 ) -> tuple[Bool[Tensor, "points"], Int[Tensor, "points"], Int[Tensor, "points"]]:
-    """Return which world points lie in the picture of one view, and in which of its pixels (x, y; elsewhere 0).
+    """Return which world points are inside the picture of one view, and in which of its pixels (x, y; 0 if outside).
 
-    Whether something hides them is not asked.
+    Occlusion is ignored.
     """
     pixel = project(cameras, view, points)
     inside = (camera_coordinates(cameras, view, points)[:, 2] < 0) | (cameras.lens_model == "equirectangular")
@@ -196,7 +196,7 @@ def seen_at(
 
 
 def image_plane(cameras: Cameras, view: int, per_side: int = 33) -> Float[Tensor, "points 2"]:
-    """Return a coarse grid over one image, its border and corners included, as places in the plane."""
+    """Return a coarse grid over one image, including its border and corners, as positions in the plane."""
     x, y = (
         torch.linspace(0.5, float(size[view]) - 0.5, per_side).to(cameras.focal)
         for size in (cameras.width, cameras.height)
@@ -205,7 +205,7 @@ def image_plane(cameras: Cameras, view: int, per_side: int = 33) -> Float[Tensor
 
 
 def _turned(directions: Float[Tensor, "*rays 3"]) -> Float[Tensor, "*rays 3"]:
-    # From a camera's axes (right, up, back) to those of its lens (right, down, forward), or the other way.
+    # From a camera's axes (right, up, back) to those of its lens (right, down, forward), or back.
     x, y, z = directions.unbind(dim=-1)
     return torch.stack([x, -y, -z], dim=-1)
 

@@ -1,4 +1,4 @@
-"""What of a scene is shown: rays cut to a box, or to begin farther away."""
+"""Show part of a scene: rays cut to a box, or begun farther away."""
 
 from dataclasses import dataclass, replace
 
@@ -12,13 +12,13 @@ from nerf_lightning.nerf.geometry.world_frame import points_from_user, unit_of
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 
-# Farther than any light that a finite number of samples tells from infinity.
+# Farther than anything that a finite number of samples distinguishes from infinity.
 ENDLESS = 1e9
 
 
 @dataclass(frozen=True)
 class CropBox:
-    """A box along the axes of the capture's own frame, as the working frame sees it."""
+    """A box along the axes of the capture's own frame, in the working frame."""
 
     corner: Float[Tensor, "3"]
     """The user's lower corner, in scene coordinates."""
@@ -31,7 +31,7 @@ class CropBox:
     def from_user(
         cls, lower: tuple[float, float, float], upper: tuple[float, float, float], to_user: Float[Tensor, "4 4"]
     ) -> "CropBox":
-        """Return the box between two corners given in the user's frame, the second one greater in every coordinate."""
+        """Return the box between two corners in the user's frame, the second one greater in every coordinate."""
         corners = torch.tensor([lower, upper], dtype=torch.float64)
         corner, unit = points_from_user(corners[:1], to_user.double())[0], unit_of(to_user.double())
         axes = to_user[:3, :3].double() / unit
@@ -44,7 +44,7 @@ class CropBox:
         return distances_in_box(inside, torch.stack([torch.zeros_like(self.size), self.size]))
 
     def holds(self, points: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
-        """Return which points lie inside."""
+        """Return which points are inside."""
         place = self._in_box(points)
         return ((place > 0) & (place < self.size)).all(dim=-1)
 
@@ -55,15 +55,15 @@ class CropBox:
 
 @dataclass(frozen=True)
 class Clip:
-    """Where rays begin and end other than as they were trained."""
+    """Where rays begin and end, if not as in training."""
 
     near: float | None = None
-    """Distance from the camera in scene units; None: as trained."""
+    """Distance from the camera in scene units; None: as in training."""
     box: CropBox | None = None
-    """None: everything."""
+    """The box to show; None: everything."""
 
     def __call__(self, rays: RayBundle, straight: RayBundle, ndc: bool) -> RayBundle:
-        """Return the rays cut; where nothing is left of a ray, it ends where it begins.
+        """Return the clipped rays; if nothing is left of a ray, it ends where it begins.
 
         Args:
             rays: as the model takes them, through the world or through normalized device coordinates.

@@ -1,7 +1,7 @@
-"""The cones of pixels: how far the space that one sample stands for reaches (Sec. 3.1, arXiv 2103.13415).
+"""The cones of pixels: the extent of the space that one sample represents (Sec. 3.1, arXiv 2103.13415).
 
-A pixel is no line. Between two distances its cone is about a normal distribution, of sigma_t along the ray and sigma_r
-across. A covariance is kept as its six entries xx, yy, zz, xy, xz, yz.
+A pixel is not a line. Between two distances its cone is approximated by a normal distribution, with sigma_t along the
+ray and sigma_r across. A covariance is stored as its six entries xx, yy, zz, xy, xz, yz.
 """
 
 import torch
@@ -12,7 +12,7 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 ROWS, COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 UNIFORM_VARIANCE = 1.0 / 12.0
-"""Of a uniform distribution over a unit of length."""
+"""Variance of a uniform distribution over a unit of length."""
 
 
 def cone_covariance(
@@ -21,7 +21,7 @@ def cone_covariance(
     """Return Sigma = sigma_t^2 d d^T + sigma_r^2 (1 - d d^T), with the variances of uniform distributions.
 
     Args:
-        directions: of the rays, unit length.
+        directions: the rays' directions, unit length.
         along: length of each sample's interval.
         across: side of the pixel at the sample.
 
@@ -35,7 +35,7 @@ def cone_covariance(
 
 
 def scaled_covariance(covariance: Float[Tensor, "*points 6"], scale: Float[Tensor, "3"]) -> Float[Tensor, "*points 6"]:
-    """Return the covariances once the axes of space are scaled."""
+    """Return the covariances after scaling the axes of space."""
     return covariance * (scale[ROWS] * scale[COLUMNS])
 
 
@@ -45,7 +45,7 @@ def contracted_covariance(
 ) -> Float[Tensor, "*points 6"]:
     """Return J Sigma J^T, J the Jacobian of `contraction.contract` at the positions (Sec. 3, arXiv 2111.12077).
 
-    Outside of the unit ball lengths along the radius r shrink by 1 / r^2, those around it by (2 - 1/r) / r.
+    Outside the unit ball, lengths along the radius r shrink by 1 / r^2, those around it by (2 - 1/r) / r.
     """
     radius = positions.norm(dim=-1, keepdim=True).clamp(min=1.0)
     around, outward = (2.0 - 1.0 / radius) / radius, 1.0 / radius.square()

@@ -1,4 +1,4 @@
-"""All space contracted into a ball (Sec. 5, arXiv 2111.12077), and the spacing of samples that goes with it."""
+"""The contraction of all space into a ball (Sec. 5, arXiv 2111.12077), and the matching spacing of samples."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class Contracted(nn.Module):
-    """A switch that the scene sets, unless the config has.
+    """A switch set by the scene, unless the config sets it.
 
     Args:
-        fixed: what the config says; None leaves it to the scene.
+        fixed: the config's value; None leaves it to the scene.
     """
 
     switch: Tensor
@@ -23,17 +23,17 @@ class Contracted(nn.Module):
         super().__init__()
         self.fixed = fixed
         self.register_buffer("switch", torch.tensor(bool(fixed)))
-        # Reading the buffer stops a GPU, so it is read once.
+        # Reading the buffer stalls a GPU, so it is read once.
         self._known: bool | None = bool(fixed)
 
     def fit_to(self, scene: Scene) -> None:
-        """Do as the scene says."""
+        """Set the switch as the scene says."""
         if self.fixed is None:
             self.switch.fill_(scene.space == "contracted")
         self.forget()
 
     def forget(self) -> None:
-        """Look the buffer up again, since it was written to."""
+        """Read the buffer again, since it was written to."""
         self._known = None
 
     def is_on(self) -> bool:
@@ -48,7 +48,7 @@ class Contracted(nn.Module):
 
 
 def in_unit_ball(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3"]) -> Float[Tensor, "*points 3"]:
-    """Map a box onto the cube that the unit ball just holds: its corners come to lie on the ball.
+    """Map a box to the cube inscribed in the unit ball: its corners are then on the sphere.
 
     >>> in_unit_ball(torch.tensor([3.0, 3.0, 3.0]), torch.tensor([[1.0, 1, 1], [3, 3, 3]])).norm().round(decimals=6)
     tensor(1.)
@@ -57,7 +57,7 @@ def in_unit_ball(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3
 
 
 def contract(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-    """Bring all space into the ball of radius 2: x inside the unit ball, `(2 - 1/|x|) x/|x|` outside.
+    """Map all space into the ball of radius 2: x inside the unit ball, `(2 - 1/|x|) x/|x|` outside.
 
     Eq. 10 of arXiv 2111.12077.
 

@@ -1,4 +1,4 @@
-"""From which directions cameras look at the middle of what they see."""
+"""The directions from which cameras look at the middle of what they see."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 
 def middle_of(scene: SceneRecord) -> Float[Tensor, "3"]:
-    """Return what the views are said to be around: the middle of the box, or where the cameras' axes meet."""
+    """Return the middle that the views are around: that of the box, or where the cameras' axes meet."""
     if scene.space == "bounded":
         return scene.aabb.mean(dim=0)
     if scene.space == "ndc" and isinstance(scene, Scene) and len(scene.points):

@@ -1,4 +1,4 @@
-"""Which lenses can be inverted over their whole image; views with others are left out before anything is learned."""
+"""Check which lenses can be inverted over their whole image; views with others are left out before training."""
 
 from collections.abc import Sequence
 
@@ -11,21 +11,21 @@ from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plan
 from nerf_lightning.nerf.types.scene import Cameras
 
 TOLERANCE = 0.01
-"""Pixels by which a place in the image may be missed on the way to its ray and back."""
+"""Maximum error in pixels of a position in the image after mapping it to its ray and back."""
 STEPS_FROM_AXIS = 8
-"""Places looked at between the axis and each place of the grid."""
+"""Positions checked between the axis and each position of the grid."""
 
 
 def lens_faults(cameras: Cameras, names: Sequence[str]) -> dict[int, str]:
-    """Return the views whose lens shows one direction at two places of the image, or cannot be inverted there, and why.
+    """Return the views whose lens shows one direction at two image positions, or cannot be inverted there, and why.
 
-    Looked at is a grid of 33 x 33 places from border to border of each image. Each must come back from its direction
-    to `TOLERANCE` pixels, and on the way to it from the axis the lens must not fold back: beyond a fold the inverse
+    The check uses a grid of 33 x 33 positions from border to border of each image. Each must map to its direction and
+    back within `TOLERANCE` pixels, and the lens must not fold back between the axis and it: beyond a fold the inverse
     may be exact and still wrong.
 
     Args:
         cameras: all views; a pinhole is always fine.
-        names: of the views, or of their cameras, for the messages.
+        names: names of the views, or of their cameras, for the messages.
     """
     if cameras.lens_model == "pinhole":
         return {}
@@ -64,7 +64,7 @@ def _fault(cameras: Cameras, view: int) -> str | None:
 
 
 def _innermost(cameras: Cameras, view: int, plane: Float[Tensor, "points 2"], bad: Bool[Tensor, "points"]) -> str:
-    """Name the bad place that is nearest to the principal point."""
+    """Return a description of the bad position that is nearest to the principal point."""
     at = plane[torch.where(bad, plane.norm(dim=-1), torch.inf).argmin()] * cameras.focal[view] + cameras.center[view]
     return f"pixel ({float(at[0]):.0f}, {float(at[1]):.0f})"
 

@@ -1,8 +1,8 @@
-"""Lenses: how real ones bend what a pinhole would show, and back.
+"""Lenses: how they distort a pinhole's image, and the inverse.
 
 Axes are the lens's own: x right, y down, z forward, so that all formulas and signs are those of OpenCV (its modules
-calib3d and fisheye). `plane` is a place in the image in focal lengths from the principal point, as photographed
-(distorted). The six coefficients of `lens` are k1, k2, k3, k4, p1, p2; beware: OpenCV lists the radial and tangential
+calib3d and fisheye). `plane` is a position in the image in focal lengths from the principal point, as photographed
+(distorted). The six coefficients of `lens` are k1, k2, k3, k4, p1, p2; note that OpenCV lists the radial and tangential
 ones as k1, k2, p1, p2, k3. Sources: Brown, "Close-range camera calibration", 1971; Kannala and Brandt, "A generic
 camera model and calibration method", 2006.
 """
@@ -16,26 +16,26 @@ from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 from nerf_lightning.nerf.types.scene import LensModel
 
 NEWTON_STEPS = 8
-"""A fixed number: shapes and control flow must not depend on values. Mild lenses need 3, hard ones 5."""
+"""Fixed, since shapes and control flow must not depend on values. Mild lenses need 3, strong ones 5."""
 ON_AXIS = 1e-12
-"""Radii below this count as this: the axis itself has no direction around it, and its gradient must be finite."""
+"""Smaller radii are clamped to this: the axis has no heading around it, and its gradient must be finite."""
 
 
 def with_coefficients(model: LensModel) -> LensModel:
-    """Return the model that a camera has once coefficients are learned: a pinhole is a lens that bends nothing."""
+    """Return a camera's model once coefficients are learned: a pinhole is a lens without distortion."""
     return "radial_tangential" if model == "pinhole" else model
 
 
 def project_plane(
     directions: Float[Tensor, "*rays 3"], lens: Float[Tensor, "*#rays 6"], model: LensModel
 ) -> Float[Tensor, "*rays 2"]:
-    """Return where the lens shows directions of any length.
+    """Return the image positions at which the lens shows directions of any length.
 
     * pinhole: (x / z, y / z) =: (u, v); r^2 = u^2 + v^2.
     * radial_tangential: (u, v) (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8)
       + (2 p1 u v + p2 (r^2 + 2 u^2), p1 (r^2 + 2 v^2) + 2 p2 u v).
     * fisheye: theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) along (x, y), with theta the angle from the
-      axis; directions behind the camera have their place too.
+      axis; directions behind the camera have a position, too.
     * equirectangular: azimuth and depression (`geometry.panoramas`).
 
     >>> lens = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -54,9 +54,9 @@ def project_plane(
 def unproject(
     plane: Float[Tensor, "*rays 2"], lens: Float[Tensor, "*#rays 6"], model: LensModel
 ) -> Float[Tensor, "*rays 3"]:
-    """Return the directions (not of unit length) that the lens shows at places of the image.
+    """Return the directions (not of unit length) that the lens shows at image positions.
 
-    The inverse of `project_plane` wherever `geometry.lens_checks.lens_faults` finds nothing.
+    The inverse of `project_plane` wherever `geometry.lens_checks.lens_faults` finds no fault.
     """
     if model == "equirectangular":
         return unproject_panorama(plane)
@@ -71,11 +71,11 @@ def unproject(
 def stretches(
     directions: Float[Tensor, "*rays 3"], lens: Float[Tensor, "*#rays 6"], model: LensModel
 ) -> Float[Tensor, "*rays 2"]:
-    """Return by how much the lens stretches its surroundings at each direction: the least and the most.
+    """Return the lens's minimum and maximum stretch of its surroundings at each direction.
 
     For a fisheye, per radian: d theta_d / d theta along the radius and theta_d / sin(theta) around it; for a panorama
-    per radian, too. For the others, against a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where the
-    least is not above 0, the lens folds back.
+    per radian, too. For the others, relative to a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where
+    the minimum is not above 0, the lens folds back.
     """
     if model == "equirectangular":
         return panorama_stretches(directions)
@@ -133,9 +133,9 @@ def _distorted(plane: Tensor, lens: Tensor) -> tuple[Tensor, tuple[Tensor, Tenso
 def undistort(
     plane: Float[Tensor, "*points 2"], lens: Float[Tensor, "*#points 6"], newton_steps: int
 ) -> Float[Tensor, "*points 2"]:
-    """Return where a radial and tangential lens takes its places in the plane from."""
-    # Newton's iteration in two dimensions. From the distorted point on it cannot overshoot a lens that bends one way
-    # only (barrel: from below a concave function; pincushion: from above a convex one).
+    """Return the undistorted positions that a radial and tangential lens shows at positions in the plane."""
+    # Newton's iteration in two dimensions. Starting at the distorted point, it cannot overshoot for a lens that bends
+    # one way only (barrel: from below a concave function; pincushion: from above a convex one).
     found = plane
     for _ in range(newton_steps):
         bent, (along_x, across, along_y) = _distorted(found, lens)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.rays import RayBundle
 
-# No ray runs sideways or back: it would never reach the far plane.
+# No ray points sideways or back: it would never reach the far plane.
 LEAST_FORWARD = 1e-3
-# The expected depth of light that comes from infinity, in units of the near plane's distance, about.
+# Bounds 1 / gap, the expected depth of light from infinity in units of the near plane's distance.
 LEAST_GAP = 2e-3
 
 
@@ -33,7 +33,7 @@ def ndc_points(points: Float[Tensor, "*points 3"], scale: Float[Tensor, "*#point
 
 
 def ndc_rays(rays: RayBundle, scale: Float[Tensor, "*#rays 2"]) -> RayBundle:
-    """Return the rays as straight lines through the cube, from the near plane (distance 0) to infinity (far).
+    """Return the rays as straight lines through the cube, from the near plane (distance 0) to infinity (`far`).
 
     Args:
         rays: in the world, looking along -z.
@@ -50,9 +50,9 @@ def ndc_rays(rays: RayBundle, scale: Float[Tensor, "*#rays 2"]) -> RayBundle:
 
 
 def world_distance(rays: RayBundle, share: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-    """Return the distance along world rays of a point that lies at `share` (0 to 1) of the way through the cube.
+    """Return the distance along world rays of a point at `share` (0 to 1) of the way through the cube.
 
-    At the share s the depth behind the near plane's disparity is 1/|z| = (1 - s) / |z_near|.
+    At share s the disparity is 1/|z| = (1 - s) / |z_near|.
     """
     origins, forward = _at_near_plane(rays)
     before = ((origins - rays.origins) * rays.directions).sum(dim=-1)
@@ -62,7 +62,7 @@ def world_distance(rays: RayBundle, share: Float[Tensor, "*rays"]) -> Float[Tens
 
 
 def share_at_distance(rays: RayBundle, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-    """Return the share of the way through the cube at a distance along world rays; before the near plane it is 0.
+    """Return the share of the way through the cube at a distance along world rays; 0 before the near plane.
 
     The inverse of `world_distance`.
     """
@@ -75,5 +75,5 @@ def _at_near_plane(rays: RayBundle) -> tuple[Float[Tensor, "*rays 3"], Float[Ten
     forward = rays.directions[..., 2].clamp(max=-LEAST_FORWARD)
     reach = -(1.0 + rays.origins[..., 2]) / forward
     origins = rays.origins + reach[..., None] * rays.directions
-    # What the clamp of a sideways ray leaves behind must still lie on the plane.
+    # A clamped sideways ray must still start on the plane.
     return torch.cat([origins[..., :2], -torch.ones_like(origins[..., 2:])], dim=-1), forward

@@ -1,18 +1,18 @@
-"""Between which distances a camera meets the content of a scene, wherever it stands."""
+"""Near and far distances of a scene's content from a camera at any position."""
 
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# A camera among the content begins to see at this share of the photographs' distance.
+# For a camera within the content, near is this share of the photographs' distance.
 LEAST_NEAR = 0.01
 
 
 def near_and_far_from(
     eyes: Float[Tensor, "frames 3"], scene: SceneRecord
 ) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
-    """Return between which distances cameras that stand at `eyes` see the content of a scene (scene units)."""
+    """Return the near and far distances of a scene's content from cameras at `eyes` (scene units)."""
     if scene.space != "bounded" or scene.cameras.ndc is not None:
         return scene.near.min().expand(len(eyes)), scene.far.max().expand(len(eyes))
     return near_and_far(eyes, scene.cameras.c2w[:, :, 3], scene.aabb.mean(dim=0), scene.near, scene.far)
@@ -25,17 +25,17 @@ def near_and_far(
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
 ) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
-    """Return near and far of cameras that need not stand where the photographs were taken.
+    """Return near and far of cameras that need not be where the photographs were taken.
 
-    The photographs say how far the content of a bounded scene reaches to this side of its middle and to that: it is
-    neither cut off from close by nor lost from afar.
+    The photographs determine how far the content of a bounded scene reaches on both sides of its middle, so that it is
+    neither cut off from close up nor lost from afar.
 
     Args:
-        eyes: where the cameras stand.
+        eyes: positions of the cameras.
         photographed_from: where the photographs were taken.
-        middle: of the scene's box.
-        near: of each photograph.
-        far: of each photograph.
+        middle: center of the scene's box.
+        near: near distance of each photograph.
+        far: far distance of each photograph.
 
     >>> import torch
     >>> middle, photographed_from = torch.zeros(3), torch.tensor([[4.0, 0, 0]])

@@ -1,8 +1,8 @@
 """Panoramas: equirectangular pictures of all directions around a camera.
 
-Axes are those of lenses (x right, y down, z forward). A place in the image counts radians: azimuth from forward to the
-right, from -pi to pi, and how far below the horizon, from -pi / 2 on top to pi / 2. So the focal length of a whole
-panorama is width / (2 pi) and height / pi pixels.
+Axes are those of lenses (x right, y down, z forward). A position in the image is in radians: azimuth from forward to
+the right, from -pi to pi, and depression below the horizon, from -pi / 2 at the top to pi / 2. So the focal length of a
+whole panorama is width / (2 pi) and height / pi pixels.
 """
 
 import math
@@ -36,7 +36,7 @@ def unproject_panorama(angles: Float[Tensor, "*rays 2"]) -> Float[Tensor, "*rays
 
 
 def panorama_stretches(directions: Float[Tensor, "*rays 3"]) -> Float[Tensor, "*rays 2"]:
-    """Return by how much a panorama stretches its surroundings: 1 upwards, 1 / cos(depression) around."""
+    """Return a panorama's stretch of its surroundings: 1 vertically, 1 / cos(depression) horizontally."""
     level = torch.hypot(directions[..., 0], directions[..., 2]) / directions.norm(dim=-1)
     return torch.stack([torch.ones_like(level), 1.0 / level.clamp(min=1e-6)], dim=-1)
 
@@ -44,14 +44,14 @@ def panorama_stretches(directions: Float[Tensor, "*rays 3"]) -> Float[Tensor, "*
 def panorama_footprint(
     cameras: Cameras, view: int, directions: Float[Tensor, "cells 3"], half_diagonal: float
 ) -> tuple[Float[Tensor, "cells"], Float[Tensor, "cells"], Float[Tensor, "cells"]]:
-    """Return x, y and radius in pixels of the discs that hold spheres; see `footprints.footprint`.
+    """Return x, y and radius in pixels of the discs that contain spheres; see `footprints.footprint`.
 
-    The radius of what lies near a pole or across the picture's seam reaches beyond the picture, as a part of it does.
+    Near a pole or across the picture's seam, the radius reaches beyond the picture, as a part of the sphere does.
 
     Args:
         cameras: all views.
-        view: which of them.
-        directions: of the spheres' centers from the camera, in the lens's axes, scene units.
+        view: index of the view.
+        directions: vectors from the camera to the spheres' centers, in the lens's axes, scene units.
         half_diagonal: the spheres' radius in scene units.
     """
     distance = directions.norm(dim=-1)
@@ -59,7 +59,7 @@ def panorama_footprint(
     angles = project_panorama(directions)
     at = angles * cameras.focal[view] + cameras.center[view]
     highest = angles[:, 1].abs() + half_angle
-    # Around: sin(azimuth) = sin(half_angle) / cos(depression) where the sphere is widest.
+    # Horizontally: sin(azimuth) = sin(half_angle) / cos(depression) where the sphere is widest.
     around = torch.asin((half_angle.sin() / angles[:, 1].cos().clamp(min=1e-6)).clamp(max=1.0))
     radius = torch.maximum(cameras.focal[view, 0] * around, cameras.focal[view, 1] * half_angle)
     whole = cameras.width[view] + cameras.height[view]
@@ -68,7 +68,7 @@ def panorama_footprint(
 
 
 def panorama_cameras(c2w: Float[Tensor, "views 3 4"], width: int, height: int) -> Cameras:
-    """Return cameras that see all directions, in pictures whose middle shows what lies along their -z axis."""
+    """Return cameras that see all directions, in pictures centered on their -z axis."""
     views = c2w.shape[0]
     return Cameras(
         c2w=c2w,

@@ -1,4 +1,4 @@
-"""The photographs of a scene, for a model that looks at them, and what follows from where they were taken."""
+"""The photographs of a scene, for a model that renders from them, and what follows from their positions."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,10 @@ def photographs_of(scene: Scene, views: Sequence[int]) -> Photographs:
 
     Args:
         scene: one capture, or several that were joined.
-        views: numbers of the photographs that may be looked at; the trained ones, as a rule.
+        views: numbers of the photographs that may be used; usually the trained ones.
 
     Raises:
-        InputError: rays would run through normalized device coordinates, where no photograph was taken.
+        InputError: the rays are in normalized device coordinates, where no photograph was taken.
     """
     if scene.cameras.ndc is not None:
         raise InputError(
@@ -40,7 +40,7 @@ def photographs_of(scene: Scene, views: Sequence[int]) -> Photographs:
 def _stands(
     cameras: Cameras, capture: Int[Tensor, "views"], count: int
 ) -> tuple[Float[Tensor, "captures 3"], Bool[Tensor, "captures"]]:
-    # What the cameras of each capture look at, and whether they stand around it.
+    # What the cameras of each capture look at, and whether they surround it.
     middle, around = torch.zeros(count, 3), torch.zeros(count, dtype=torch.bool)
     for number in capture.unique().tolist():
         its_own = cameras[capture == number]

@@ -9,7 +9,7 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 @disable_autocast
 def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
-    """Return which poses are a rotation (orthonormal, determinant +1) and a finite center."""
+    """Return which poses have a valid rotation (orthonormal, determinant +1) and a finite center."""
     rotation = c2w[..., :3]
     identity = torch.eye(3, dtype=c2w.dtype, device=c2w.device)
     off = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))
@@ -18,12 +18,12 @@ def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[
 
 
 def flip_yz(c2w: Float[Tensor, "*views 3 4"]) -> Float[Tensor, "*views 3 4"]:
-    """Turn camera-to-world poses with OpenCV's axes (right, down, ahead) into ours (right, up, back), and back."""
+    """Convert camera-to-world poses from OpenCV's axes (right, down, ahead) to ours (right, up, back), or back."""
     return c2w * c2w.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def rotation_from_quaternion(quaternion: Float[Tensor, "*views 4"]) -> Float[Tensor, "*views 3 3"]:
-    """Return the rotation of a quaternion w, x, y, z of any length but zero.
+    """Return the rotation of a quaternion w, x, y, z of any nonzero length.
 
     >>> rotation_from_quaternion(torch.tensor([1.0, 0.0, 0.0, 1.0])).round().tolist()  # a quarter turn around z
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -38,7 +38,7 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*views 4"]) -> Float[Ten
 
 
 SMALL_ANGLE = 0.1
-"""Below it (radians) the coefficients of the exponential map are their series, to 1e-14."""
+"""Below it (radians) the coefficients of the exponential map use their series, accurate to 1e-14."""
 
 
 @disable_autocast
@@ -54,7 +54,7 @@ def rotation_from_vector(vector: Float[Tensor, "*views 3"]) -> Float[Tensor, "*v
     """
     square = vector.square().sum(dim=-1)
     is_small = square < SMALL_ANGLE**2
-    # The branch that is not taken is given a safe angle: its gradient would be NaN, and NaN times 0 is NaN.
+    # The branch not taken gets a safe angle: its gradient would be NaN, and NaN times 0 is NaN.
     angle = torch.where(is_small, 1.0, square).sqrt()
     series = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
     half_series = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
@@ -90,7 +90,7 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Ten
 def look_at(
     eye: Float[Tensor, "*views 3"], target: Float[Tensor, "*views 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*views 3 4"]:
-    """Return cameras at `eye` that look at `target` with the picture's top toward `up`.
+    """Return cameras at `eye` that look at `target`, with the picture's top toward `up`.
 
     >>> eye, target, up = torch.tensor([0.0, -4, 0]), torch.zeros(3), torch.tensor([0.0, 0, 1])
     >>> look_at(eye, target, up)[:, 2].tolist()  # the back axis points from the target to the eye

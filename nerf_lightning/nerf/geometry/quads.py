@@ -1,4 +1,4 @@
-"""A picture's pixels in quads: 2 x 2 that touch follow one another, so that their rays can share work."""
+"""A picture's pixels in quads: adjacent 2 x 2 pixels are consecutive, so that their rays can share work."""
 
 import torch
 from jaxtyping import Float
@@ -8,11 +8,11 @@ from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Cameras
 
 QUAD = 4
-"""Pixels of a quad."""
+"""Pixels per quad."""
 
 
 def pixels_in_quads(height: int, width: int) -> int:
-    """Return how many pixels the quads of a picture have: in an odd last row or column pixels come twice.
+    """Return the number of pixels in a picture's quads: those of an odd last row or column count twice.
 
     >>> pixels_in_quads(3, 2)
     8
@@ -21,7 +21,7 @@ def pixels_in_quads(height: int, width: int) -> int:
 
 
 def quads_between(cameras: Cameras, view: int, part: slice) -> PixelIndex:
-    """Return some pixels of one view, numbered quad by quad from 0."""
+    """Return a range of pixels of one view, numbered quad by quad from 0."""
     number = torch.arange(part.start, part.stop, device=cameras.c2w.device)
     width, height = int(cameras.width[view]), int(cameras.height[view])
     quad, corner, across = number // QUAD, number % QUAD, -(-width // 2)

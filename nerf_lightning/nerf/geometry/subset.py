@@ -1,10 +1,10 @@
-"""A few of many views, evenly spread over all."""
+"""A subset of the views, evenly spaced."""
 
 from collections.abc import Sequence
 
 
 def evenly_spaced_subset(views: Sequence[int], most: int) -> list[int]:
-    """Return at most so many of the views, spread over all.
+    """Return at most `most` of the views, evenly spaced.
 
     >>> evenly_spaced_subset([3, 4, 5, 6], 2)
     [3, 5]

@@ -1,4 +1,4 @@
-"""Surfaces as depth maps: where a ray has half of its light behind it, and which way the surface faces there."""
+"""Surfaces as depth maps: the depth of the light that was stopped, and the surface's normals."""
 
 import math
 from itertools import product
@@ -11,11 +11,11 @@ from torch.nn.functional import normalize, pad
 from nerf_lightning.nerf.row_chunks import row_chunks
 
 _SEEN = 1e-3
-"""Opacity below which a ray met nothing: what is left of its depth is rounding."""
+"""Opacity below which a ray met nothing: the rest of its depth is rounding."""
 REACH, SIGMA = 2, 1.5
-"""Pixels to each side that a normal is taken from, and the width of their weights."""
+"""Pixels on each side that a normal is computed from, and the width of their weights."""
 LEAST_ALIKE = 1e-4
-"""Weight of what seems to be another surface: where all do, a plane through them is better than none."""
+"""Weight of pixels that seem to be on another surface: if all are, a plane through them is better than none."""
 
 
 def surface_depth(
@@ -23,8 +23,8 @@ def surface_depth(
 ) -> Float[Tensor, "*rays"]:
     """Return the expected distance of the light that was stopped: (depth - (1 - opacity) far) / opacity.
 
-    A rendering's depth lets the light that escapes end at far; here its share is taken out. A ray that met
-    nothing (opacity below 0.001) ends at far.
+    A rendering's depth counts light that escapes at far; this removes its share. A ray that met nothing (opacity below
+    0.001) ends at far.
     """
     met = opacity > _SEEN
     return torch.where(met, (depth - (1 - opacity) * far) / torch.where(met, opacity, 1.0), far)
@@ -33,10 +33,11 @@ def surface_depth(
 def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
     """Return unit normals, facing the camera, of a surface given as each pixel's point (world axes).
 
-    Each pixel has those of a plane through the 5 x 5 pixels around it, by weighted least squares; zero where they lie
-    on a line. Differences of neighbors alone show the depth's waves, whose length is a cell of the field's, and go
-    wrong wherever a neighbor sees another surface. So near pixels count more (a Gaussian), and those whose points are
-    as far apart as a surface's are: s pixels away, s times as far as the second nearest of the four neighbors,
+    Each pixel has the normal of a plane through the 5 x 5 pixels around it, by weighted least squares; zero if they are
+    on a line. Differences of neighbors alone show the depth's ripples, whose length is a cell of the field, and go
+    wrong wherever a neighbor sees another surface. So nearby pixels count more (a Gaussian), and so do those whose
+    points are as far apart as on one surface: s pixels away, s times as far as the second nearest of the four
+    neighbors,
 
         w = exp(-s^2 / (2 sigma^2)) exp(-((|p_k - p| - s gap) / gap)^2).
 
@@ -73,7 +74,7 @@ def _normals(points: Float[Tensor, "height width 3"]) -> Float[Tensor, "height w
             sums[0].add_(each)
             sums[1].add_(each, alpha=down)
             sums[2].add_(each, alpha=along)
-    # The slopes are these covariances times a positive matrix, which leaves the direction of their product.
+    # The slopes are these covariances times a positive matrix, which keeps the direction of their cross product.
     down_slope.sub_((total_down / total)[..., None] * mean).div_(gap[..., None])
     along_slope.sub_((total_along / total)[..., None] * mean).div_(gap[..., None])
     return normalize(torch.linalg.cross(down_slope, along_slope), dim=-1)

@@ -1,4 +1,4 @@
-"""A working frame for a capture: which way is up, where the middle is, and how large a unit should be."""
+"""A working frame for a capture: which way is up, where the middle is, and how large a unit is."""
 
 import torch
 from jaxtyping import Float, Float64
@@ -11,18 +11,18 @@ from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 FORWARD_FACING = 0.82
 """Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees)."""
 
-# An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
+# An axis is clear if its eigenvalue is smaller than the next by this much, as a share of the cameras.
 CLEAR = 0.05
 
 LEAST_UNIT, LARGEST_UNIT = 1e-12, 1e12
-"""Scene units in the user's own: from atoms to planets."""
+"""Limits of a scene unit in the user's units: from atoms to planets."""
 
 
 @disable_autocast
 def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     """Return the point that is nearest to all optical axes, by least squares.
 
-    sum (I - d d^T) x = sum (I - d d^T) o. Where the axes are all but parallel, the cameras' mean is a weak second.
+    sum (I - d d^T) x = sum (I - d d^T) o. Where the axes are almost parallel, the cameras' mean is a weak fallback.
 
     >>> eyes = torch.tensor([[4.0, 0, 1], [0.0, 4, 1]])
     >>> from nerf_lightning.nerf.geometry.poses import look_at
@@ -38,9 +38,9 @@ def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
 
 @disable_autocast
 def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Return what the cameras are said to be around: where their axes meet, or where they stand.
+    """Return the middle that the cameras are around: where their axes meet, or where the cameras are.
 
-    Panoramas look everywhere, and the axis of one means nothing: they are in the middle of what they show.
+    Panoramas look everywhere, and their axes mean nothing: they are in the middle of what they show.
     """
     if cameras.lens_model == "equirectangular":
         return cameras.c2w[:, :, 3].mean(dim=0)
@@ -49,7 +49,7 @@ def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
 
 @disable_autocast
 def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
-    """Return the cosine between the mean direction of the cameras and the camera that is farthest from it.
+    """Return the cosine between the cameras' mean direction and the direction farthest from it.
 
     >>> least_agreement(torch.eye(4)[:3].repeat(2, 1, 1))
     1.0
@@ -60,11 +60,11 @@ def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
 
 @disable_autocast
 def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
-    """Return the unit vector that points up in the world, as the photographer held the camera.
+    """Return the unit vector that points up in the world, judged by how the photographer held the camera.
 
-    Photographs are level: their rows are horizontal, so up is what all right axes are perpendicular to; of photographs
-    that lie on their side, what all up axes are perpendicular to. The clearer of the two counts. Where neither is
-    clear, since all cameras look the same way, it is the mean of their up axes.
+    Photographs are level: their rows are horizontal, so up is perpendicular to all right axes; for photographs on their
+    side, to all up axes. The clearer of the two counts. If neither is clear, since all cameras look the same way, it is
+    the mean of their up axes.
     """
     right, up, back = c2w[:, :, :3].unbind(dim=-1)
     mean_up = functional.normalize(up.mean(dim=0), dim=0)
@@ -76,14 +76,14 @@ def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
             best, axis, upright = clear, vectors[:, 0], rows is right
     if axis is None:
         return mean_up
-    # On their side the photographs do not say which end is up: people look down on things.
+    # Photographs on their side do not show which end is up: people look down on things.
     sign = (axis @ mean_up) if upright else (axis @ back.mean(dim=0))
     return axis if sign >= 0 else -axis
 
 
 @disable_autocast
 def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the smallest rotation that takes `up` (unit) to +z.
+    """Return the smallest rotation that maps `up` (unit) to +z.
 
     >>> (upright_rotation(torch.tensor([0.0, 1, 0])) @ torch.tensor([0.0, 1, 0])).tolist()
     [0.0, 0.0, 1.0]
@@ -100,7 +100,7 @@ def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 
 @disable_autocast
 def y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """Return the rotation that takes `up` (unit) to +y, as glTF has it, and what a frame with z up calls x to x.
+    """Return the rotation that maps `up` (unit) to +y, as in glTF, and the x axis of a z-up frame to x.
 
     >>> (y_up(torch.tensor([0.0, 0.0, 1.0])) @ torch.tensor([1.0, 2.0, 3.0, 1.0])).tolist()
     [1.0, 3.0, -2.0, 1.0]
@@ -111,7 +111,7 @@ def y_up(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
 
 
 def gaps_around(azimuth: Float[Tensor, "views"]) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
-    """Return azimuths in degrees in order, and the way from each to the next, the last one's to the first.
+    """Return sorted azimuths in degrees, and the gap from each to the next (from the last one to the first).
 
     >>> [part.tolist() for part in gaps_around(torch.tensor([90.0, 0.0, -120.0]))]
     [[-120.0, 0.0, 90.0], [120.0, 90.0, 150.0]]
@@ -121,7 +121,7 @@ def gaps_around(azimuth: Float[Tensor, "views"]) -> tuple[Float[Tensor, "views"]
 
 
 def average_pose(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3 4"]:
-    """Return the pose in the middle of cameras that look the same way, as LLFF takes it."""
+    """Return the average pose of cameras that look the same way, as in LLFF."""
     back = functional.normalize(c2w[:, :, 2].sum(dim=0), dim=0)
     right = functional.normalize(torch.linalg.cross(c2w[:, :, 1].sum(dim=0), back), dim=0)
     return torch.stack([right, torch.linalg.cross(back, right), back, c2w[:, :, 3].mean(dim=0)], dim=-1)
@@ -142,7 +142,7 @@ def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit:
 
 @disable_autocast
 def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return poses given in the user's frame as the working frame sees them."""
+    """Return poses in the working frame, given in the user's frame."""
     centers = points_from_user(c2w[:, :, 3], to_user)
     rotation = to_user[:3, :3] / unit_of(to_user)
     return torch.cat([rotation.mT @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
@@ -150,14 +150,14 @@ def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4
 
 @disable_autocast
 def points_from_user(points: Float[Tensor, "points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "points 3"]:
-    """Return points given in the user's frame as the working frame sees them."""
+    """Return points in the working frame, given in the user's frame."""
     rotation = to_user[:3, :3] / unit_of(to_user)
     return (points - to_user[:3, 3]) @ rotation / unit_of(to_user)
 
 
 @disable_autocast
 def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "*points 3"]:
-    """Return points of the working frame in the user's frame."""
+    """Return points in the user's frame, given in the working frame."""
     return points @ to_user[:3, :3].mT + to_user[:3, 3]
 
 
@@ -165,7 +165,7 @@ def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4
 def directions_to_user(
     directions: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*points 3"]:
-    """Return directions of the working frame in the user's frame, of the same length."""
+    """Return directions in the user's frame, given in the working frame, of the same length."""
     return directions @ to_user[:3, :3].mT / unit_of(to_user)
 
 
@@ -175,9 +175,9 @@ def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
 
 
 def told_length(record: SceneRecord) -> tuple[float, str]:
-    """Return what makes a length of the scene's frame one that people are told, and its unit.
+    """Return the factor from lengths in the scene's frame to those shown to the user, and their unit.
 
-    Meters, where the capture's unit is known to be some of them; else the capture's own units.
+    Meters if the length of the capture's unit is known; else the capture's own units.
     """
     unit = unit_of(record.to_user.double())
     if record.metres_per_unit is None:

@@ -1,6 +1,6 @@
-"""Compile CPU kernels ahead of their first use, on all cores: numba itself compiles one function after the other.
+"""Compile CPU kernels ahead of their first use, on all cores: numba itself compiles one function after another.
 
-As a program (`python -m nerf_lightning.nerf.kernels.ahead`): compile the modules named on stdin, a line each.
+As a program (`python -m nerf_lightning.nerf.kernels.ahead`): compile the modules named on stdin, one per line.
 """
 
 import subprocess
@@ -14,18 +14,18 @@ from nerf_lightning.nerf.kernels.backends import backend, is_kept, keeps_kernels
 
 
 def to_compile(modules: Sequence[str]) -> list[str]:
-    """Return which modules of kernels, by their full names, are not in numba's cache."""
+    """Return which kernel modules, given by full name, are not in numba's cache."""
     return [module for module in modules if not is_kept(module)]
 
 
 def compile_ahead(modules: Sequence[str], processes: int) -> Iterator[str]:
-    """Compile modules of kernels, and yield the name of each that is done.
+    """Compile kernel modules, and yield the name of each when it is done.
 
-    Failures are not told: `backend` tells them when it is asked for the module.
+    Failures are not reported here: `backend` reports them when it loads the module.
 
     Args:
-        modules: full names; those that take longest first.
-        processes: how many compile at a time.
+        modules: full names, slowest first.
+        processes: number of processes that compile at a time.
     """
     if processes == 1 or not keeps_kernels():
         for module in modules:

@@ -1,4 +1,4 @@
-"""Which twin of a kernel runs: numba on the CPU, triton on CUDA, plain torch elsewhere and where those are missing."""
+"""Choose a kernel's backend: numba on the CPU, triton on CUDA, plain torch elsewhere and if those are missing."""
 
 import functools
 import hashlib
@@ -26,7 +26,7 @@ CPU_BACKENDS = (
     *("render.dense", "render.gradients", "render.cpu", "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
     *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "table_adam.cpu"),
 )
-"""The modules that numba compiles, those that take longest first."""
+"""The modules that numba compiles, slowest first."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
     *("render.cuda", "histograms.cuda", "table_adam.cuda", "pixels.cuda", "rays.cuda"),
@@ -35,7 +35,7 @@ CUDA_BACKENDS = (
 FP_FUSION = "TRITON_DEFAULT_FP_FUSION"
 LONG_SECONDS = 2.0
 DIGEST_BYTES = hashlib.sha256().digest_size
-# What triton says where there is no C compiler, and where that finds no headers.
+# What triton says if there is no C compiler, and if it finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
 
 log = logging.getLogger(__name__)
@@ -46,17 +46,17 @@ _reasons: dict[str, str] = {}
 
 @functools.cache
 def backend(module: str) -> ModuleType | None:
-    """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible.
+    """Import and try a module of compiled kernels; None, with one warning that names the cause, if that is impossible.
 
     Args:
-        module: its full name; it has a function `trial` that runs each of its kernels once, on next to nothing.
+        module: its full name; it has a function `trial` that runs each of its kernels once on tiny input.
     """
     library = "triton" if module.endswith(".cuda") else "numba"
     try:
-        if library == "triton":  # products and sums in one rounding, which triton warns of where nobody has said so
+        if library == "triton":  # fused multiply-add, about which triton warns unless it was requested
             os.environ.setdefault(FP_FUSION, "1")
         found = _imported(module) if library == "triton" else _with_cache(module)
-        # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
+        # Compiled when first called: better here, where a fallback exists, than in the middle of a step.
         with nullcontext() if library == "numba" and _is_kept(found) else _told_if_long(library):
             try:
                 _try(found)
@@ -72,10 +72,10 @@ def backend(module: str) -> ModuleType | None:
 
 
 def is_kept(module: str) -> bool:
-    """Return whether numba's cache has kernels of a module, compiled from the sources that there are."""
+    """Return whether numba's cache has kernels of a module, compiled from the present sources."""
     try:
         return _is_kept(_with_cache(module))
-    except Exception:  # whatever `backend` will tell
+    except Exception:  # `backend` will report it
         return False
 
 
@@ -88,7 +88,7 @@ def _is_kept(module: ModuleType) -> bool:
 
 
 def keeps_kernels() -> bool:
-    """Return whether other processes find in numba's cache what this one has compiled."""
+    """Return whether other processes find in numba's cache what this one compiles."""
     return not _kept
 
 
@@ -106,7 +106,7 @@ def _try(module: Any) -> None:
 
 @contextmanager
 def _told_if_long(library: str) -> Iterator[None]:
-    """Say what takes so long, where a compiler does: a person who has just installed the program waits for a line."""
+    """Log what is happening if the compiler takes long: after an installation the user waits for a sign of life."""
     timer = threading.Timer(LONG_SECONDS, _tell_once, [library])
     timer.daemon = True
     timer.start()
@@ -122,7 +122,7 @@ def _tell_once(library: str) -> None:
 
 
 def why_not(module: str) -> str:
-    """Return why there is no twin, once `backend` has said so."""
+    """Return why there is no compiled module, once `backend` has returned None."""
     return _reasons.get(module, "unknown")
 
 
@@ -130,7 +130,7 @@ def _imported(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except RuntimeError as error:
-        if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
+        if "no locator available" not in str(error):  # numba's words for an unwritable cache
             raise
     _cache_elsewhere(
         "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
@@ -140,9 +140,9 @@ def _imported(module: str) -> ModuleType:
 
 
 def _stamp_with_sources(module: ModuleType) -> None:
-    """Let numba compile kernels anew where a file changed that they take functions or numbers from, or one is damaged.
+    """Let numba recompile kernels if a file that they import from has changed, or a cached kernel is damaged.
 
-    numba compares a kept kernel with the kernel's own file alone, and loads it whatever its bytes are.
+    numba itself compares a cached kernel only with the kernel's own file, and loads it whatever its bytes are.
     """
     for kernel in _compiled(module):
         kept, digest = getattr(kernel._cache, "_cache_file", None), _digest(kernel.py_func.__module__)
@@ -179,7 +179,7 @@ def _digest(module: str) -> str:
 
 
 def _sources(module: str) -> set[Path]:
-    """Return the files of a module of kernels, and of all modules of ours that it imports from."""
+    """Return the files of a kernel module, and of all modules of this program that it imports from."""
     found: set[Path] = set()
     waiting = [module]
     while waiting:
@@ -200,7 +200,7 @@ def _compiled(module: ModuleType) -> list[Any]:
 
 
 def _forget_compiled(module: ModuleType) -> int:
-    """Let numba forget what it keeps of a module's kernels, and return of how many."""
+    """Make numba forget a module's compiled kernels, and return how many."""
     kernels = _compiled(module)
     for kernel in kernels:
         kernel._cache.flush()
@@ -209,7 +209,7 @@ def _forget_compiled(module: ModuleType) -> int:
 
 @functools.cache
 def _cache_elsewhere(reason: str) -> None:
-    """Let numba keep what it compiles in a folder that lasts as long as this process."""
+    """Make numba cache what it compiles in a folder that lasts as long as this process."""
     import numba
 
     folder = tempfile.TemporaryDirectory(prefix="nerf-numba-")
@@ -219,7 +219,7 @@ def _cache_elsewhere(reason: str) -> None:
 
 
 _kept: list[tempfile.TemporaryDirectory[str]] = []
-"""Folders that go when the process does."""
+"""Folders that are removed when the process ends."""
 
 
 _switched_off: set[str] = set()
@@ -227,7 +227,7 @@ _switched_off: set[str] = set()
 
 @contextmanager
 def without(*modules: str) -> Iterator[None]:
-    """Let the torch twins of some kernels run instead, for comparisons."""
+    """Run the torch twins of some kernels within the context, for comparisons."""
     former = set(_switched_off)
     _switched_off.update(modules)
     try:
@@ -238,7 +238,7 @@ def without(*modules: str) -> Iterator[None]:
 
 
 def is_on(module: str) -> bool:
-    """Return whether a kernel has not been switched off."""
+    """Return whether a kernel is enabled."""
     return module not in _switched_off
 
 
@@ -260,27 +260,27 @@ def backend_for(kernel: str, device: torch.device) -> ModuleType | None:
 
 
 def can_compile(device: torch.device) -> bool:
-    """Return whether torch.compile has what it needs: a C++ compiler on the CPU."""
+    """Return whether torch.compile has what it needs: on the CPU, a C++ compiler."""
     return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
 
 
 def _configure_numba() -> None:
     import numba
 
-    # Straight code of four equal operations becomes one of four lanes.
+    # Straight-line code of four equal operations becomes one operation on four lanes.
     numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
     _require_own_cache(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
 
 
 def _require_own_cache(folder: str) -> None:
-    """Let numba read nothing of a folder that others can write to: what it keeps there are programs, and pickles."""
+    """Refuse a cache folder that others can write to: numba's cache holds programs and pickles."""
     if not folder:
         return
     try:
         os.makedirs(folder, mode=0o700, exist_ok=True)
         about = os.stat(folder)
     except OSError:
-        return  # numba itself notices
+        return  # numba notices by itself
     if hasattr(os, "geteuid") and (about.st_uid != os.geteuid() or stat.S_IMODE(about.st_mode) & 0o022):
         _cache_elsewhere(
             f"NUMBA_CACHE_DIR is {folder}, which belongs to somebody else or can be written by others "

@@ -1,10 +1,10 @@
-"""Search in sorted numbers, in the way that suits the device."""
+"""Search in sorted numbers, in the way best for the device."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-# Elsewhere (XLA, and whatever comes after it) the search would go to the host and back.
+# On other devices (XLA and later ones) the search would go to the host and back.
 SEARCHING_DEVICES = ("cpu", "cuda", "mps")
 
 
@@ -24,7 +24,7 @@ def search(
 def search_by_comparison(
     ordered: Float[Tensor, "*rays n"], numbers: Float[Tensor, "*rays m"], right: bool = False
 ) -> Int[Tensor, "*rays m"]:
-    """Return the same by comparing all with all; a compiler fuses comparison and sum, so that no n x m is stored.
+    """Return the same by comparing all pairs; a compiler fuses comparison and sum, so no n x m array is stored.
 
     >>> search_by_comparison(torch.tensor([1.0, 2.0, 2.0, 3.0]), torch.tensor([0.0, 2.0, 9.0]), right=True).tolist()
     [0, 3, 4]

@@ -1,8 +1,8 @@
-"""Work that is shared out over threads of ours, each of which computes alone.
+"""Work shared among our own threads, each of which computes alone.
 
-The kernels release Python's lock and know of no threads; torch's own operations release it too. So whole tiles of a
-training step run beside each other, or, where one thread stands alone, the rows of one kernel. Nothing depends on
-which thread takes what: parts and their order are fixed.
+The kernels are single-threaded and release the GIL, as torch's own operations do. So whole tiles of a training step run
+in parallel or, outside of tiles, the rows of one kernel. Results do not depend on which thread takes what: parts and
+their order are fixed.
 """
 
 import functools
@@ -20,7 +20,7 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 FEWEST_ROWS = 512
-"""A part of fewer rows costs more to hand over than to compute."""
+"""A part of fewer rows costs more to dispatch than to compute."""
 PARTS_PER_THREAD = 4
 """More parts than threads, since some take longer than others."""
 
@@ -33,16 +33,16 @@ _kept = _Kept()
 
 
 def num_threads() -> int:
-    """Return how many threads work is shared out over: as many as torch has, or had before `torch_on_one_thread`."""
+    """Return the number of threads that share work: as many as torch has, or had before `torch_on_one_thread`."""
     return torch.get_num_threads() if _kept.threads is None else _kept.threads
 
 
 @contextmanager
 def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
-    """Within, torch's own operations take one thread, and what is shared out here as many as before.
+    """Within the context, torch's own operations use one thread, and work shared here as many as before.
 
-    Between kernels of ours torch has little to do, and its threads wait for one another in each operation: where
-    another program has one of the cores for a moment, all of them wait, which made steps four times as slow.
+    Between our kernels torch has little to do, and its threads wait for one another in each operation: when another
+    program takes one of the cores for a moment, all of them wait, which made steps four times as slow.
 
     Args:
         shares_out: whether `in_parallel` still uses several threads.
@@ -62,15 +62,15 @@ def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
 def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Do the work on each part, on `num_threads()` threads, and return the results in order.
 
-    The calling thread takes parts, too, so that small work is done before another thread has woken up. Within a part
-    torch has one thread, and so has whatever is called there. Of the caller's settings, those of gradients hold in each
-    thread, and no others. Raises what the work raises, and takes no further parts then.
+    The calling thread takes parts, too, so that small work is done before another thread wakes up. Within a part, torch
+    and `in_parallel` use one thread. Of the caller's settings, only those of gradients apply in each thread. If the
+    work raises, take no further parts and reraise.
     """
     threads = min(num_threads(), len(parts))
     if threads < 2:
         return [work(part) for part in parts]
     numbers, results, failed = itertools.count(), [None] * len(parts), []  # type: ignore[var-annotated]
-    # A thread's own settings, which those of the pool do not share.
+    # Settings of the calling thread, which the pool's threads do not inherit.
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
 
     def take_parts() -> None:
@@ -94,17 +94,17 @@ def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[R
 
 
 def threads_on(device: torch.device) -> int:
-    """Return how many parts of the work on a device run beside each other: on the CPU as many as torch has threads."""
+    """Return how many parts of the work on a device run in parallel: on the CPU, as many as torch has threads."""
     return num_threads() if device.type == "cpu" else 1
 
 
 def over_rows(kernel: Callable[..., Any], rows: int, *arrays: Any) -> None:
-    """Call kernel(first, last, *arrays) for parts of the rows that together are all of them."""
+    """Call kernel(first, last, *arrays) for parts that together make up all rows."""
     in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, num_threads()))
 
 
 def parts_of(rows: int, threads: int, fewest: int = FEWEST_ROWS) -> list[tuple[int, int]]:
-    """Return the parts that rows are shared out in, of no fewer than `fewest`; for one thread a single one.
+    """Return the parts into which rows are split, of at least `fewest` rows; for one thread, a single part.
 
     >>> parts_of(4096, 1), parts_of(1200, 8)
     ([(0, 4096)], [(0, 600), (600, 1200)])
@@ -118,12 +118,12 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     pool, all_there = ThreadPoolExecutor(threads, "tiles", initializer=_compute_alone), threading.Barrier(threads)
     former = torch.get_num_threads()
     list(pool.map(lambda _: all_there.wait(), range(threads)))
-    torch.set_num_threads(former)  # the calling thread's and what threads begin with: those of the pool changed that
+    torch.set_num_threads(former)  # of the calling thread, and the default of new ones: the pool's threads changed it
     return pool
 
 
 def _compute_alone() -> None:
-    torch.get_num_threads()  # else a thread takes what threads begin with when it asks for the first time
+    torch.get_num_threads()  # else the thread's first query would reset it to the default
     torch.set_num_threads(1)
 
 

@@ -1,4 +1,4 @@
-"""A function of the mathematics, which a kernel is asked before; its own body is the reference."""
+"""Let a kernel replace a mathematical function where possible; the function's own body is the reference."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -11,14 +11,13 @@ Result = TypeVar("Result")
 
 
 def with_kernel(*modules: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Let a function return what a kernel does on the device of its first argument, and compute only where none does.
+    """Let a function return the result of a kernel for its first argument's device, and compute only if there is none.
 
-    Whoever changes the function changes its kernels, too, or removes this decorator until they follow: tests compare
-    them.
+    When changing the function, change its kernels, too, or remove this decorator until they follow: tests compare them.
 
     Args:
-        modules: of `nerf.kernels`, such as `random.cpu`. Each has a function of the same name and arguments, which
-            returns None where it does not take what it is given.
+        modules: modules of `nerf.kernels`, such as `random.cpu`. Each has a function of the same name and arguments,
+            which returns None for arguments that it does not support.
 
     >>> import torch
     >>> @with_kernel("random.cpu")

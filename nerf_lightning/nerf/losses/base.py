@@ -1,4 +1,4 @@
-"""The contract of a loss: what the levels saw against what the photographs show, as a sum of named terms."""
+"""The contract of a loss: renderings of the levels compared with photographs, as a sum of named terms."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -12,28 +12,28 @@ from nerf_lightning.nerf.types.rays import RayBundle, Target
 
 
 class Loss(Part, ABC):
-    """A weighted mean over rays, so that the losses of tiles add up to that of the batch.
+    """A weighted mean over rays, so that the losses of tiles add up to the batch's.
 
-    The weights come with a mean of 1 over the batch: a ray's number is multiplied by its weight before the plain mean.
+    The weights have a mean of 1 over the batch: a ray's value is multiplied by its weight before the plain mean.
     Dividing by the sum of a tile's own weights would let tiles with few unmasked rays count too much.
     """
 
     patch: int = 1
-    """Side in pixels of the squares that it wants to see whole: batches hold one after the other, row by row."""
+    """Side in pixels of the square patches that the loss needs: batches hold one after another, row by row."""
 
     depth_every: int = 0
-    """One of so many rays of a batch runs through a pixel whose distance is known; 0: those are no special rays."""
+    """One in this many rays of a batch goes through a pixel whose distance is known; 0: no such rays are added."""
 
     needs_weights: bool = False
-    """Whether it looks at the weights and samples of renderings, which levels may leave out otherwise."""
+    """Whether the loss uses the weights and samples of renderings, which levels may omit otherwise."""
 
     def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
-        """Return the rays whose renderings it looks at, in place of those through a batch's pixels, and their target.
+        """Return the rays to render instead of those through a batch's pixels, and their target.
 
         Args:
-            rays: through the pixels, as the model takes them.
+            rays: rays through the pixels, as the model takes them.
             target: what the photographs show there.
-            random: the step's numbers for these rays; None: nothing is drawn.
+            random: the step's random numbers for these rays; None: nothing is drawn.
         """
         return rays, target
 
@@ -43,5 +43,5 @@ class Loss(Part, ABC):
 
         Args:
             renderings: one per level.
-            target: what the photographs show, how much each ray counts, and where in which photograph it lies.
+            target: what the photographs show, how much each ray counts, and its photograph and pixel.
         """

@@ -1,4 +1,4 @@
-"""Depth of sparse points as supervision: weights along a ray gather where structure from motion saw a surface."""
+"""Depth supervision by sparse points: weights along a ray gather where structure from motion saw a surface."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.rays import RayBundle, Target
 from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 
 AT_THE_POINT = 0.9
-"""Share of a known distance from which on weights belong to the point."""
+"""Share of a known distance beyond which weights belong to the point."""
 RANGES = {"every": (2, 1024), "fade": (0.0, 1.0), "beside": (0.0, 1.0), "reach": (0.0, 10.0)}
 
 
@@ -49,11 +49,11 @@ class DepthLoss(Loss):
     factor: Tensor
 
     def on_step(self, context: StepContext) -> None:
-        """Fade."""
+        """Decay the term."""
         self.factor.fill_(self.fade**context.progress)
 
     def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
-        """Return some of the rays to known points from beside their cameras; colors are those for the cameras."""
+        """Return the rays, with some of those to known points moved beside their cameras; colors are the cameras'."""
         if target.distance is None or target.certainty is None or target.infinity is not None:
             return rays, target
         if random is None or not self.beside:
@@ -65,22 +65,22 @@ class DepthLoss(Loss):
             origins=torch.where(moved[:, None], origins, rays.origins),
             directions=torch.where(moved[:, None], directions, rays.directions),
         )
-        # Their colors do not count, and the mean weight of the batch stays 1.
+        # Colors of moved rays do not count, and the mean weight of the batch stays 1.
         weight = torch.where(moved, 0.0, target.weight * self.depth_every / (self.depth_every - self.beside))
         return rays, replace(target, distance=torch.where(moved, distance, target.distance), weight=weight)
 
     def forward(
         self, renderings: list[DenseRendering | RaggedRendering], target: Target
     ) -> dict[str, Float[Tensor, "levels"]]:
-        """Return the weighted mean over rays of known distance, of the last level."""
+        """Return the last level's weighted mean over rays of known distance."""
         last, none = renderings[-1], torch.zeros_like(renderings[-1].depth[0])
         if target.distance is None or target.certainty is None:
             return {"depth": torch.stack([none] * len(renderings))}
         error = distance_error(last, target.distance, target.infinity) + (1.0 - last.opacity)
-        # From beside, something solid may stand before the point: only what is half transparent is wrong then.
+        # Seen from the side, something solid may hide the point: then only what is half transparent is wrong.
         arrives = 1.0 - weight_before(last, AT_THE_POINT * target.distance).detach()
         error = torch.where(target.weight > 0.0, error, arrives * error)
-        # A mean over all rays, so that tiles add up; only one of `depth_every` has a distance.
+        # A mean over all rays, so that tiles add up; only one in `depth_every` has a distance.
         mean = (error * target.certainty).mean() * self.depth_every
         return {"depth": torch.stack([*[none] * (len(renderings) - 1), self.factor * mean])}
 
@@ -88,12 +88,12 @@ class DepthLoss(Loss):
 def from_beside(
     rays: RayBundle, distance: Float[Tensor, "rays"], shift: Float[Tensor, "rays 3"]
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """Return origins that are shifted across the rays, unit directions to the same points, and their distances.
+    """Return origins shifted across the rays, unit directions to the same points, and their distances.
 
     Args:
         rays: in world coordinates.
-        distance: of the points along the rays.
-        shift: of the origins as a share of the distance; what lies along the ray is left out.
+        distance: distance of the points along the rays.
+        shift: shift of the origins as a share of the distance; its component along the ray is ignored.
     """
     points = rays.origins + distance[:, None] * rays.directions
     along = (shift * rays.directions).sum(dim=-1, keepdim=True)
@@ -106,7 +106,7 @@ def from_beside(
 def weight_before(
     rendering: DenseRendering | RaggedRendering, distance: Float[Tensor, "rays"]
 ) -> Float[Tensor, "rays"]:
-    """Return the opacity of what lies nearer along each ray than `distance`: one minus the light that arrives."""
+    """Return the opacity along each ray before `distance`: one minus the light that arrives there."""
     t, weights = rendering.samples.midpoints, rendering.weights
     if isinstance(rendering, RaggedRendering):
         nearer = weights * (t < distance[rendering.samples.ray_index])

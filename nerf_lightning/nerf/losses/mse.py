@@ -13,7 +13,7 @@ from nerf_lightning.nerf.types.renderings import Rendering
 
 
 class MeanSquaredError(Loss):
-    """Mean squared error of the color, every level alike, so that the coarse level learns where to look."""
+    """Mean squared error of the color, equally for every level, so that the coarse level learns where to look."""
 
     def forward(self, renderings: list[Rendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return the weighted mean over rays and channels, per level."""
@@ -21,7 +21,7 @@ class MeanSquaredError(Loss):
 
 
 def squared_errors(renderings: Sequence[Rendering], target: Target) -> Float[Tensor, "levels"]:
-    """Return each level's mean squared error of colors over rays, which are weighted, and channels."""
+    """Return each level's mean squared error of colors over weighted rays and channels."""
     rgb = torch.stack([rendering.rgb for rendering in renderings])
     errors = mse_loss(rgb, target.rgb.expand_as(rgb), reduction="none")
     return (errors * target.weight[..., None]).mean(dim=(1, 2))

@@ -37,7 +37,7 @@ class ProposalLoss(Loss):
         """Return weighted means over rays: interlevel of each proposal, color and distortion of the last level."""
         last, weight = renderings[-1], target.weight
         none = torch.zeros_like(last.depth[0])
-        # Rays to known distances may have no color.
+        # Rays to known distances may have no color to compare.
         known = weight if target.certainty is None else weight.maximum(target.certainty)
         bounds = [self.interlevel * (interlevel_loss(last, proposal) * known).mean() for proposal in renderings[:-1]]
         before = [none] * len(bounds)
@@ -56,7 +56,7 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
     """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray (Eq. 13).
 
     bound_i is the weight of all intervals of the proposal that touch interval i (Eq. 12): a proposal may claim too
-    much, but what the last level sees must lie within it. Only the proposal receives gradients.
+    much, but must cover what the last level sees. Only the proposal receives gradients.
     """
     weights, edges = last.weights.detach(), last.samples.edges.detach()
     bound = outer_weights(edges, proposal.samples.edges.detach(), proposal.weights)
@@ -84,7 +84,7 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray (Eq. 15).
 
     m and d are midpoints and lengths as shares of the sampled part of the ray, in the spacing of its samples. The
-    double sum is taken in linear time, since the midpoints are in order:
+    double sum takes linear time, since the midpoints are sorted:
     2 sum_i w_i (m_i sum_{j<i} w_j - sum_{j<i} w_j m_j).
     """
     edges, w = rendering.samples.edges, rendering.weights

@@ -1,7 +1,7 @@
-"""A trimmed loss against what only some photographs show: people, cars, shadows, reflections.
+"""A trimmed loss that ignores what only some photographs show: people, cars, shadows, reflections.
 
-RobustNeRF (Sabour et al., 2023, arXiv 2302.00833): what the scene cannot explain has large residuals that lie together,
-whereas fine detail has large residuals among small ones.
+RobustNeRF (Sabour et al., 2023, arXiv 2302.00833): what the scene cannot explain has clustered large residuals, whereas
+fine detail has large residuals among small ones.
 """
 
 from dataclasses import replace
@@ -18,23 +18,24 @@ from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.rays import RayBundle, Target
 
 LEAST_NEAR, LEAST_AROUND = 0.5, 0.6
-"""Shares of good pixels from which on a pixel is kept for its neighbors' sake: in 3 x 3, and in the whole square."""
+"""Minimum shares of good pixels for which a pixel is kept because of its neighbors: in 3 x 3, and in the whole
+square."""
 MEMORY = 0.9
-"""Of the threshold, what is left of it after a step; a single batch may show hardly anything but people."""
+"""Weight of the old threshold in its update per step; a single batch may show hardly anything but people."""
 FIRST_THRESHOLD = 1.0
-"""No color in [0, 1] is farther off than that: at first nothing is left out."""
+"""No residual of colors in [0, 1] is larger: at first nothing is left out."""
 RANGES = {"share": (0.01, 1.0), "times": (0.1, 1000.0), "patch": (4, 256)}
 
 
 class RobustLoss(Loss):
-    """Leave the pixels that the scene does not explain out of another loss.
+    """Exclude the pixels that the scene does not explain from another loss.
 
     The threshold is learned: a multiple of a quantile of the last picture's residuals, averaged over the steps. Rays
     come in squares of pixels; those beyond the last whole square are all kept.
 
-    The paper's threshold is the median itself, which keeps detail away for the hundred thousands of steps that it
-    trains, and its squares have 16 pixels a side. Shorter trainings need a threshold that most of the scene stays
-    below at any time, and steps that see more places.
+    The paper's threshold is the median itself, which suppresses detail over the hundreds of thousands of steps that it
+    trains, and its squares are 16 x 16 pixels. Shorter trainings need a threshold that most of the scene is below at
+    any time, and steps that see more places.
 
     Args:
         of: the loss of the remaining pixels, for all levels.
@@ -57,16 +58,16 @@ class RobustLoss(Loss):
         self.register_buffer("threshold", torch.tensor(FIRST_THRESHOLD))
 
     threshold: Tensor
-    """Greatest residual of a pixel that is kept for itself."""
+    """Largest residual of a pixel that is kept regardless of its neighbors."""
 
     def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
-        """Return those of the other loss."""
+        """Return the rays of the other loss."""
         return self.of.rays_to_render(rays, target, random)
 
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
-        """Return what the other loss does for the rays that are kept; the others weigh 0."""
+        """Return the other loss over the rays that are kept; the others have weight 0."""
         error = residuals(renderings[-1].rgb.detach(), target.rgb)
-        # What a mask leaves out speaks against no neighbor.
+        # Masked pixels do not count against their neighbors.
         kept = kept_pixels((error <= self.threshold) | (target.weight == 0), self.patch)
         return self.of(renderings, replace(target, weight=target.weight * kept))
 
@@ -74,7 +75,7 @@ class RobustLoss(Loss):
     def after_step(
         self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
     ) -> None:
-        """Move the threshold toward that of a step's residuals; masked pixels have none."""
+        """Move the threshold toward that of a step's residuals, without masked pixels."""
         known = torch.where(weight > 0, residuals(rgb, target), torch.nan)
         wanted = self.times * torch.nanquantile(known, float(self.share))
         moved = MEMORY * self.threshold + (1.0 - MEMORY) * wanted
@@ -85,7 +86,7 @@ class RobustLoss(Loss):
         return [self.threshold]
 
     def reset_parameters(self) -> None:
-        """Leave nothing out again."""
+        """Reset the threshold, so that nothing is left out."""
         super().reset_parameters()
         self.threshold.fill_(FIRST_THRESHOLD)
 
@@ -96,13 +97,13 @@ def residuals(rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"]) -> 
 
 
 def kept_pixels(good: Bool[Tensor, "rays"], patch: int) -> Bool[Tensor, "rays"]:
-    """Return which pixels are trained on: the good ones, and others that most of their surroundings vouch for.
+    """Return which pixels are trained on: the good ones, and others with mostly good surroundings.
 
-    Eq. 8 to 10 of arXiv 2302.00833: a pixel is kept where it is good, or at least half of its neighbors of 3 x 3 are
-    (those within the square), or it lies in the inner half of a square (8 x 8 of 16 x 16) of which 60 % are kept so.
+    Eq. 8 to 10 of arXiv 2302.00833: a pixel is kept if it is good, or at least half of its 3 x 3 neighbors (those
+    within the square) are, or it is in the inner half of a square (8 x 8 of 16 x 16) of which 60 % are kept so.
 
     Args:
-        good: squares of pixels one after the other, row by row.
+        good: squares of pixels one after another, row by row.
         patch: side of the squares.
     """
     whole = len(good) // patch**2 * patch**2

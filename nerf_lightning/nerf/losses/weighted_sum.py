@@ -1,4 +1,4 @@
-"""Several losses side by side, each with a weight and a curve of its own."""
+"""Several losses at once, each with its own weight and curve."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ class WeightedSum(Loss):
         weights: name -> factor; 1 for a loss that is not named.
 
     Raises:
-        ValueError: a weight of no loss, or squares of several sizes.
+        ValueError: a weight without a loss, or patches of several sizes.
     """
 
     def __init__(self, terms: dict[str, Loss], weights: dict[str, float] | None = None):
@@ -34,14 +34,14 @@ class WeightedSum(Loss):
         self.needs_weights = any(loss.needs_weights for loss in terms.values())
 
     def rays_to_render(self, rays: RayBundle, target: Target, random: RayRandom | None) -> tuple[RayBundle, Target]:
-        """Return the rays that all losses look at, one loss after the other."""
+        """Return the rays of all losses, applied one after another."""
         for loss in self.terms.values():
             if isinstance(loss, Loss):
                 rays, target = loss.rays_to_render(rays, target, random)
         return rays, target
 
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
-        """Return the terms of all losses, times their weights; several of one loss as `name_term`."""
+        """Return the terms of all losses times their weights; several terms of one loss as `name_term`."""
         found: dict[str, Tensor] = {}
         for name, loss in self.terms.items():
             terms = loss(renderings, target)

@@ -1,4 +1,4 @@
-"""The contract of a model: what training, bench, exporters and the viewer ask of it, and no more."""
+"""The contract of a model: exactly what training, bench, exporters and the viewer need."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -23,21 +23,21 @@ Baselines = Callable[[Scene, list[int], Background, int], dict[str, Any]]
 
 
 class Model(Part, ABC):
-    """Render rays, in one round or in several that build on each other; the last one's picture counts."""
+    """Render rays in one round, or in several that build on each other; the last one's picture counts."""
 
     has_static_shapes: bool = True
-    """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+    """False if shapes depend on what is found along the rays; compilers such as XLA's refuse that."""
     needs_photographs: bool = False
-    """True where it renders a scene from photographs: `set_source_images` is called before the first rays."""
+    """True if it renders a scene from photographs: `set_source_images` is called before the first rays."""
     baselines: Baselines | None = None
-    """Mean PSNR (dB) of views that are shown by so many photographs, without the model, for each way to do so."""
+    """Returns the mean PSNR (dB) of views rendered from a number of photographs without the model, for each method."""
 
     def __init__(self) -> None:
         super().__init__()
         self.subpixels = Subpixels()
-        """How many rays go through each pixel, in training and in pictures."""
+        """Number of rays through each pixel, in training and in pictures."""
         self.most_rays: int | None = None
-        """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
+        """Number of rays at once that rendering has lowered to after running out of memory; None: it has not."""
         self.register_load_state_dict_post_hook(_look_at_what_was_loaded)
 
     @property
@@ -47,7 +47,7 @@ class Model(Part, ABC):
 
     @property
     def first_picture(self) -> int | None:
-        """The number of the first round whose rendering is a picture, where that is not the last one."""
+        """The index of the first round whose rendering is a picture, if that is not the last one."""
         return None
 
     @abstractmethod
@@ -63,31 +63,31 @@ class Model(Part, ABC):
         """
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
-        """Return whether kernels take rays from end to end and share them out over threads, so that tiles may be large.
+        """Return whether kernels process whole rays and share them among threads, so that tiles may be large.
 
         Args:
-            device: of the parameters.
+            device: device of the parameters.
             training: whether gradients follow.
-            learns_cameras: whether gradients of rays are wanted, too.
+            learns_cameras: whether gradients of rays are needed, too.
         """
         return False
 
     @abstractmethod
     def points_per_ray(self, training: bool) -> float:
-        """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
+        """Return the largest number of points that a ray sends through any field at once: it determines the tiles."""
 
     def set_source_images(self, photographs: Photographs) -> None:
-        """Take the photographs that rays are rendered from, in the place of earlier ones; most models need none.
+        """Set the photographs that rays are rendered from, replacing earlier ones; most models need none.
 
-        They are no part of the model's state: no checkpoint carries them.
+        They are not part of the model's state: no checkpoint contains them.
         """
 
     def rounds(self) -> dict[str, nn.Module]:
-        """Return what learns in each round, by name: the norms of its gradients are logged."""
+        """Return the module that learns in each round, by name; the norms of its gradients are logged."""
         return {self.level_names[-1]: self}
 
     def kernels(self) -> tuple[str, ...]:
-        """Return the modules of `nerf.kernels` that training takes on a CPU, to be compiled ahead of the first step."""
+        """Return the modules of `nerf.kernels` that training uses on a CPU, to be compiled ahead of the first step."""
         return ()
 
     def compile_fields(self) -> list[str]:
@@ -96,22 +96,22 @@ class Model(Part, ABC):
 
 
 class PointField(Model):
-    """A model of one scene, which has density and color at points by themselves: exporters ask it for both."""
+    """A model of one scene with density and color at single points, which exporters need."""
 
     @abstractmethod
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density per unit length, as the last level's rays find it."""
+        """Return the density per unit length, as rays of the last level find it."""
 
     @abstractmethod
     def query(self, points: Points) -> FieldOutput:
-        """Return what the last level's field says of points."""
+        """Return the output of the last level's field at points."""
 
 
 def point_field(model: Model) -> PointField:
-    """Return a model that has density and color at points.
+    """Return the model, if it has density and color at points.
 
     Raises:
-        InputError: it renders rays alone.
+        InputError: it renders only rays.
     """
     if isinstance(model, PointField):
         return model
@@ -122,20 +122,20 @@ def point_field(model: Model) -> PointField:
 
 
 def _look_at_what_was_loaded(model: Model, _: Any) -> None:
-    """Let the parts of a model look at what was loaded into them.
+    """Let the parts of a model check their loaded state.
 
     Raises:
-        InputError: a part holds what it never can.
+        InputError: a part's state is invalid.
     """
     for part in parts_of(model):
         part.validate_state()
 
 
 def show_photographs(model: Model, scene: Scene) -> None:
-    """Show a model the photographs that it renders a scene from, if it needs any.
+    """Give a model the photographs that it renders a scene from, if it needs any.
 
     Raises:
-        InputError: they are too few, or of a kind that the model cannot use.
+        InputError: there are too few, or the model cannot use them.
     """
     if model.needs_photographs:
         model.set_source_images(photographs_of(scene, scene.sources))

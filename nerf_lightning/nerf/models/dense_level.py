@@ -19,14 +19,14 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
 OPAQUE_BELOW = 1e-3
-"""Rays end where less light than this is left, as those of a `RaggedSampler`."""
+"""Rays end where their transmittance falls below this, as those of a `RaggedSampler`."""
 
 
 class DenseLevel(Level):
     """A level in which every ray has the same number of samples.
 
     Args:
-        sampler: where the field is asked.
+        sampler: chooses where the field is evaluated.
         field: density and color.
         gradient_scaling_distance: distance from the camera (scene units) within which gradients are scaled down,
             against floaters (`soften_near_gradients`); 0: nowhere, as in normalized device coordinates, which have no
@@ -44,16 +44,16 @@ class DenseLevel(Level):
         self.gradient_scaling_distance = gradient_scaling_distance
 
     def points_per_ray(self, before: float, training: bool) -> float:
-        """As the sampler says."""
+        """Return the sampler's number of samples."""
         return float(self.sampler.num_samples_after(int(before)))
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of whether the scene's distances are any."""
+        """Record whether the scene's distances are real ones."""
         if scene.cameras.ndc is not None:
             self.gradient_scaling_distance = 0.0
 
     def compile_field(self) -> bool:
-        """Compile the field, for static shapes: dynamic ones may be specialized otherwise after a resume."""
+        """Compile the field for static shapes: dynamic ones may be specialized differently after a resume."""
         if self.field.compiles:
             self.field.compile(dynamic=False)
         return self.field.compiles
@@ -65,10 +65,10 @@ class DenseLevel(Level):
         history: list[DenseRendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Sample, ask the field at the midpoints, composite.
+        """Sample, evaluate the field at the midpoints, and composite.
 
-        Rays are first offered to a kernel that does the last two in one; the way below is its reference. Only the
-        kernel ends rays where they are opaque.
+        A kernel does the last two in one, if possible; the code below is its reference. Only the kernel ends rays where
+        they are opaque.
         """
         samples = self.sampler(rays, history, random)
         whole_from = 0.0 if random is None else self.gradient_scaling_distance
@@ -83,7 +83,7 @@ class DenseLevel(Level):
     def _by_kernels(
         self, rays: RayBundle, samples: RaySamples, background: Float[Tensor, "rays 3"] | None, whole_from: float
     ) -> DenseRendering | None:
-        """Return what kernels see in samples; None where there are none for the field, or not all that is asked for."""
+        """Return the samples rendered by kernels; None if none support the field, or all that is needed."""
         plain = rays.near.dim() != 1 or rays.near.dtype != torch.float32
         parts = None if plain else self._parts_on(rays.near.device)
         if parts is None:
@@ -101,24 +101,24 @@ class DenseLevel(Level):
         return DenseRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
-        """Return whether there is a kernel for the field; it has gradients of rays, too."""
+        """Return whether there is a kernel for the field, which then has gradients of rays, too."""
         return device.type == "cpu" and self._parts_on(device) is not None
 
     def field_parts(self) -> FieldParts | None:
-        """Return what kernels of whole rays compute with; None where `field_output` is something else than the field's.
+        """Return what whole-ray kernels compute with; None if `field_output` differs from the field's output.
 
-        A level that changes `field_output` says here what it makes of the field.
+        A level that changes `field_output` must change this accordingly.
         """
         return self.field.parts() if type(self).field_output is DenseLevel.field_output else None
 
     def _parts_on(self, device: torch.device) -> FieldParts | None:
-        """Return the field's parts where there is a kernel for them."""
-        # Elsewhere reading them would wait for the device.
+        """Return the field's parts if there is a kernel for them."""
+        # On other devices, reading them would wait for the device.
         parts = self.field_parts() if device.type in ("cpu", "cuda") else None
         if parts is None or device.type == "cuda":
             return parts
         return parts if has_dense_kernel(parts, self.field.matmul_precision, device) else None
 
     def field_output(self, points: Points) -> FieldOutput:
-        """Return what the field says of the samples."""
+        """Return the field's output at the samples."""
         return self.field(points)

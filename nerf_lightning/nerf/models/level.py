@@ -20,7 +20,7 @@ class Level(Part):
     """The contract of a level: one round of sampling and rendering.
 
     Args:
-        sampler: where the field is asked.
+        sampler: chooses where the field is evaluated.
         field: density and color.
     """
 
@@ -30,20 +30,20 @@ class Level(Part):
     """Whether its rendering is a picture."""
 
     sampler_kind: type[Sampler] = Sampler
-    """What it can sample with."""
+    """The class of samplers that it supports."""
 
     returns_weights: bool = True
-    """Whether renderings in training have weights and samples, for a loss that looks at them (`Loss.needs_weights`)."""
+    """Whether renderings in training have weights and samples, for a loss that uses them (`Loss.needs_weights`)."""
 
     has_static_shapes: bool = True
-    """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+    """False if shapes depend on what is found along the rays; compilers such as XLA's refuse that."""
 
     takes_coupled_fields: bool = False
-    """Whether a step asks the field once, about all samples of its rays and nothing else, as batch normalization needs
-    it (`Part.couples_rays`)."""
+    """Whether a step evaluates the field exactly once, at all samples of its rays, as batch normalization requires
+    (`Part.couples_rays`)."""
 
     kernels: tuple[str, ...] = ()
-    """Modules of `nerf.kernels` that it takes on a CPU, where kernels know its field."""
+    """Modules of `nerf.kernels` that it uses on a CPU, if kernels support its field."""
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()
@@ -69,14 +69,14 @@ class Level(Part):
         history: list[Any],
         random: RayRandom | None,
     ) -> Rendering:
-        """Render rays; `history` is what the earlier levels saw, `random` is None outside training."""
+        """Render rays; `history` has the earlier levels' renderings, `random` is None outside training."""
 
     @abstractmethod
     def points_per_ray(self, before: float, training: bool) -> float:
-        """Return how many points a ray sends through the field at once, given how many the level before had."""
+        """Return how many points a ray sends through the field at once, given the number of the previous level."""
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
-        """Return whether a kernel takes rays from end to end (`Model.takes_whole_rays`)."""
+        """Return whether a kernel processes whole rays (`Model.takes_whole_rays`)."""
         return False
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
@@ -88,5 +88,5 @@ class Level(Part):
         return self.field.density(Points(positions))[0]
 
     def compile_field(self) -> bool:
-        """Compile the field where its shapes do not depend on the data; tell whether it was."""
+        """Compile the field if its shapes do not depend on the data; return whether it was."""
         return False

@@ -1,4 +1,4 @@
-"""A level that masks what an occupancy grid rules out instead of leaving it out: every shape is known beforehand."""
+"""A level that masks what an occupancy grid rules out instead of skipping it, so that all shapes are static."""
 
 from dataclasses import replace
 
@@ -18,10 +18,10 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
 
 
 class MaskedLevel(Level):
-    """Ask the field in every interval of a ray, and let empty cells have no density.
+    """Evaluate the field in every interval of a ray, and set the density of empty cells to 0.
 
-    It renders what `RaggedLevel` renders, up to the light that is left behind samples which are opaque. It computes
-    several times as many samples, and is for compilers that need static shapes (XLA).
+    It renders the same as `RaggedLevel`, up to the light left behind opaque samples. It computes several times as many
+    samples, and is for compilers that need static shapes (XLA).
     """
 
     sampler: OccupancySampler
@@ -33,7 +33,7 @@ class MaskedLevel(Level):
         self.sampler.learn(self.field_density, context.step, context.key)
 
     def points_per_ray(self, before: float, training: bool) -> float:
-        """All intervals of the lattice."""
+        """Return the number of intervals of the lattice."""
         return float(self.sampler.lattice.numel() - 2)
 
     def forward(
@@ -43,7 +43,7 @@ class MaskedLevel(Level):
         history: list[Rendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Render rays; without a background they are open in front of black, as those of `RaggedLevel` are."""
+        """Render rays; without a background they are open in front of black, as with `RaggedLevel`."""
         state = self.sampler.start(rays, random)
         lattice = self.sampler.lattice if random is not None else self.sampler.lattice_over(rays)
         occupied, edges = occupied_intervals(rays, state, lattice, self.sampler.grid.occupied())

@@ -19,16 +19,16 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
 
 class ProposalLevel(DenseLevel):
-    """Sample, ask the field for density alone, and hand the weights on; its picture is black.
+    """Sample, evaluate only the field's density, and pass on the weights; its picture is black.
 
-    Where to look changes slower than what is seen there, so after the first steps it need not learn in each of them:
-    the time is better spent on more steps.
+    Where to look changes more slowly than what is seen there, so after the first steps the level need not learn in
+    every step: the time is better spent on more steps.
 
     Args:
-        sampler: where the field is asked.
-        field: its density is all that is used.
+        sampler: chooses where the field is evaluated.
+        field: only its density is used.
         learn_every: the proposal is trained in one of this many steps.
-        learn_always: so many steps at first, it learns in each.
+        learn_always: number of steps at the start in each of which it is trained.
         gradient_scaling_distance: distance from the camera (scene units) within which gradients are scaled down,
             against floaters; 0: nowhere, as in `DenseLevel`.
     """
@@ -51,11 +51,11 @@ class ProposalLevel(DenseLevel):
 
     @property
     def step_variant(self) -> bool:  # type: ignore[override]
-        """Whether it learns."""
+        """Whether the level learns in the next step."""
         return self._learns
 
     def on_step(self, context: StepContext) -> None:
-        """Decide whether the next step is one to learn in."""
+        """Decide whether to learn in the next step."""
         self._learns = context.step < self.learn_always or context.step % self.learn_every == 0
 
     def forward(
@@ -65,9 +65,9 @@ class ProposalLevel(DenseLevel):
         history: list[DenseRendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Sample, ask the field for its density, and return the weights; without gradients where it does not learn.
+        """Sample, evaluate the field's density, and return the weights; without gradients unless it learns.
 
-        Rays of pixels that touch share the weights of the ray between them: the proposal's cells are wider than pixels.
+        Rays of adjacent pixels share the weights of the ray between them: the proposal's cells are wider than pixels.
         """
         if rays.together > 1 and random is None:
             between = [each[:: rays.together] for each in history]
@@ -80,11 +80,11 @@ class ProposalLevel(DenseLevel):
             return super().forward(rays, background, history, random)
 
     def field_parts(self) -> FieldParts | None:
-        """Return the field's, without colors."""
+        """Return the field's parts, without colors."""
         parts = self.field.parts()
         return None if parts is None else replace(parts, color_weights=[])
 
     def field_output(self, points: Points) -> FieldOutput:
-        """Return the density, and black."""
+        """Return the density, with black as color."""
         density, _ = self.field.density(points)
         return FieldOutput(density, density.new_zeros(*density.shape, 3))

@@ -1,4 +1,4 @@
-"""A method as named levels of (sampler, field): each level samples where the one before saw something."""
+"""A method as named levels of (sampler, field): each level samples where the previous one saw something."""
 
 from typing import cast
 
@@ -17,7 +17,7 @@ from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 
 
 class RadianceModel(PointField):
-    """The original NeRF is two levels, coarse (stratified) and fine (importance); the last one is the picture.
+    """Levels, the last of which is the picture. The original NeRF has two: coarse (stratified) and fine (importance).
 
     Args:
         levels: name -> level, in order.
@@ -30,7 +30,7 @@ class RadianceModel(PointField):
         super().__init__()
         self.subpixels = Subpixels(subpixels, subpixels_from)
         self.levels = nn.ModuleDict(levels)
-        # Levels that do not fit each other are refused here; without memory (`meta`) a lattice cannot be counted.
+        # Incompatible levels are refused here; without memory (`meta`) a lattice cannot be counted.
         if not any(buffer.is_meta for buffer in self.buffers()):
             self.points_per_ray(training=False)
 
@@ -41,13 +41,13 @@ class RadianceModel(PointField):
 
     @property
     def first_picture(self) -> int | None:
-        """The number of the first level whose rendering is a picture, where it is not the last one."""
+        """The index of the first level whose rendering is a picture, if it is not the last one."""
         numbers = [number for number, level in enumerate(self._in_order()) if level.has_color]
         return numbers[0] if len(numbers) > 1 else None
 
     @property
     def has_static_shapes(self) -> bool:  # type: ignore[override]
-        """Whether no level's shapes depend on what it finds."""
+        """Whether no level has data-dependent shapes."""
         return all(level.has_static_shapes for level in self._in_order())
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
@@ -55,7 +55,7 @@ class RadianceModel(PointField):
         return all(level.takes_whole_rays(device, training, learns_cameras) for level in self._in_order())
 
     def points_per_ray(self, training: bool) -> float:
-        """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
+        """Return the largest number of points that a ray sends through any field at once: it determines the tiles."""
         counts = [0.0]
         for level in self._in_order():
             counts.append(level.points_per_ray(counts[-1], training))
@@ -67,11 +67,11 @@ class RadianceModel(PointField):
         return self._in_order()[-1]
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density per unit length, as the last level's rays find it."""
+        """Return the density per unit length, as rays of the last level find it."""
         return self.last.density(positions)
 
     def query(self, points: Points) -> FieldOutput:
-        """Return density and color of points by themselves, as the last level's field has them."""
+        """Return density and color at points, from the last level's field."""
         return self.last.field(points)
 
     def forward(
@@ -93,14 +93,14 @@ class RadianceModel(PointField):
         return history
 
     def kernels(self) -> tuple[str, ...]:
-        """Return the kernels of the levels whose fields kernels know."""
+        """Return the kernels of the levels whose fields they support."""
         return tuple(name for level in self._in_order() if level.field.parts() is not None for name in level.kernels)
 
     def compile_fields(self) -> list[str]:
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
         for module in self.modules():
             if isinstance(module, Contracted):
-                module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
+                module.is_on()  # reading its buffer in a compiled field would break the graph
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
     def rounds(self) -> dict[str, nn.Module]:

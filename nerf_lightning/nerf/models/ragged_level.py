@@ -1,4 +1,4 @@
-"""A level whose samples are packed: only where its sampler says that there may be something is anything computed."""
+"""A level with packed samples: it computes only where its sampler says that there may be something."""
 
 from threading import Lock
 from typing import Any
@@ -29,17 +29,17 @@ from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import RaggedRendering, Rendering
 
 MOST_SAMPLES = 1 << 22
-"""That are rendered at once: their features take a gigabyte and a half."""
+"""Maximum number of samples rendered at once: their features take a gigabyte and a half."""
 MOST_PER_RAY = 1 << 12
-"""That can have been counted."""
-# Threads may take tiles of one step side by side.
+"""Maximum number of samples per ray that a count can have."""
+# Threads may process tiles of one step in parallel.
 COUNTING = Lock()
 
 
 class RaggedLevel(Level):
-    """Sample, drop what lies behind opaque samples, ask the field, composite.
+    """Sample, drop what is behind opaque samples, evaluate the field, and composite.
 
-    Rays are first offered to a kernel that renders them from end to end; the way below is its reference.
+    A kernel renders whole rays, if possible; the code below is its reference.
     """
 
     sampler: RaggedSampler
@@ -61,7 +61,7 @@ class RaggedLevel(Level):
         history: list[Rendering],
         random: RayRandom | None,
     ) -> Rendering:
-        """Render rays; without random numbers and gradients as at evaluation, in chunks of samples."""
+        """Render rays; without random numbers and gradients, as at evaluation, in chunks of samples."""
         evaluates = random is None and not torch.is_grad_enabled()
         whole = self._whole_rays(rays, background, random, evaluates)
         if whole is not None:
@@ -78,9 +78,9 @@ class RaggedLevel(Level):
         return composite_ragged(output, samples, rays, background)
 
     def _all_samples_of(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering | None:
-        """Render rays with all their samples at once; None where there are too many, or no kernels.
+        """Render rays with all their samples at once; None if there are too many, or no kernels.
 
-        A GPU is faster at samples that cannot be seen than at starting kernels for one chunk after the other.
+        A GPU computes hidden samples faster than it launches kernels for one chunk after another.
         """
         if not takes_samples(rays, self.field.parts()):
             return None
@@ -95,7 +95,7 @@ class RaggedLevel(Level):
         background: Float[Tensor, "rays 3"] | None,
         features: Float[Tensor, "capacity features"] | None = None,
     ) -> Rendering | None:
-        """Render samples with the kernels for CUDA; None where they do not do all that is asked for."""
+        """Render samples with the kernels for CUDA; None if these do not support all that is needed."""
         parts, precision = self.field.parts(), self.field.matmul_precision
         integrated = render_samples(rays, samples, parts, precision, features=features)
         if integrated is None:
@@ -104,13 +104,13 @@ class RaggedLevel(Level):
         return RaggedRendering.from_sums(rays, background, *sums, weights=weights, samples=samples)
 
     def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
-        """Return whether a kernel takes rays from end to end: in training without weights and gradients of rays."""
+        """Return whether a kernel processes whole rays: in training, only without weights and gradients of rays."""
         return self._parts_on(device, training, learns_cameras) is not None
 
     def _parts_on(self, device: torch.device, training: bool, learns_cameras: bool) -> FieldParts | None:
-        """Return the field's parts where there is a kernel for them."""
+        """Return the field's parts if there is a kernel for them."""
         if device.type != "cpu" or (training and (self.returns_weights or learns_cameras)):
-            return None  # on other devices reading the parts would wait for the device
+            return None  # on other devices, reading the parts would wait for the device
         parts = self.field.parts()
         return parts if has_kernel(parts, self.field.matmul_precision, device, gradients=training) else None
 
@@ -119,7 +119,7 @@ class RaggedLevel(Level):
     ) -> Rendering | None:
         matmul_precision, sampler = self.field.matmul_precision, self.sampler
         trains = torch.is_grad_enabled()
-        # Learned focal lengths and lenses turn directions alone.
+        # Learned focal lengths and lenses change only directions.
         moved = any(each.requires_grad for each in (rays.origins, rays.directions, rays.view_directions))
         parts = self._parts_on(rays.near.device, trains, moved) if evaluates or trains else None
         if parts is None:
@@ -134,7 +134,7 @@ class RaggedLevel(Level):
         return Rendering.from_light(rays, background, found.rgb, 1.0 - found.opacity, found.depth)
 
     def points_per_ray(self, before: float, training: bool) -> float:
-        """In training, as lately counted; in rendering all that are found at once on a GPU, and few (1) elsewhere."""
+        """Return the recent count in training; in rendering, all that are found on a GPU, and few (1) elsewhere."""
         counted = self.counter.per_ray
         if training:
             return max(1.0, float(self.sampler.samples_at_first) if counted is None else counted)
@@ -143,7 +143,7 @@ class RaggedLevel(Level):
         return max(1.0, self.sampler.found_per_visible * counted)
 
     def on_step(self, context: StepContext) -> None:
-        """Let the sampler learn, where it is time, and average the samples per ray of the steps since."""
+        """Let the sampler learn when it is time, and average the samples per ray of the steps since."""
         if context.step % self.sampler.update_every and context.step != 1:
             return
         self.sampler.learn(self.field_density, context.step, context.key)
@@ -165,7 +165,7 @@ class SampleCounter(Part):
         self._per_ray: float | None = None
 
     def add(self, samples: Int[Tensor, ""], rays: int, dropped: Int[Tensor, ""]) -> None:
-        """Count samples of rays, and those for which there was no room."""
+        """Count rays and their samples, and samples that did not fit."""
         counted = torch.stack([samples, torch.full_like(samples, rays), dropped])
         with COUNTING:
             self.counts += counted
@@ -179,7 +179,7 @@ class SampleCounter(Part):
 
     @property
     def per_ray(self) -> float | None:
-        """The mean number of samples of a ray; None where it is not known yet."""
+        """The mean number of samples per ray; None if it is not known yet."""
         if self._per_ray is None:
             self._per_ray = float(self.mean)
         return self._per_ray if self._per_ray >= 0 else None
@@ -194,24 +194,24 @@ class SampleCounter(Part):
         return [self.mean]
 
     def statistics(self) -> dict[str, float]:
-        """Return samples per ray, and samples for which there was no room."""
+        """Return samples per ray, and samples that did not fit."""
         return {"speed/samples_per_ray": float(self.mean), "train/dropped_samples": float(self.counts[2])}
 
     def reset_statistics(self) -> None:
-        """Forget all counts."""
+        """Reset all counts."""
         self.counts.zero_()
         self.mean.fill_(-1.0)
         self._per_ray = None
 
     def reset_parameters(self) -> None:
-        """Forget all counts."""
+        """Reset all counts."""
         self.reset_statistics()
 
     def validate_state(self) -> None:
-        """Check what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: negative counts, or a mean that cannot be.
+            InputError: negative counts, or an impossible mean.
         """
         if bool((self.counts < 0).any()) or not -1.0 <= float(self.mean) <= MOST_PER_RAY:
             raise InputError(f"The samples per ray in the model's state are not valid counts. {ANOTHER}")

@@ -1,9 +1,9 @@
 """Rays through the pixels of views: the one place where cameras become rays, in training, evaluation and films.
 
-Several rays may go through each pixel, whose mean is what a photograph's pixel shows: the light of its area. One ray
-through the center sees a point of that area. What is learned so is blurred by a pixel, and not alike from every side,
-so that other views are less sharp than those that taught it (Sec. 1, arXiv 2103.13415). The mean over a grid of rays is
-the plain cure; it costs as many times the samples, so it is for the end of a run.
+Several rays may go through each pixel; their mean is what a photograph's pixel shows: the light of its area. One ray
+through the center sees a point of that area. What is learned this way is blurred by a pixel, and differently from every
+side, so that other views are less sharp than the training views (Sec. 1, arXiv 2103.13415). The mean over a grid of
+rays is the simple cure; it multiplies the number of samples, so it is for the end of a run.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ MOST_PER_SIDE = 8
 
 
 class Subpixels(Part):
-    """How many rays go through each pixel now, along each of its sides.
+    """The current number of rays through each pixel, along each of its sides.
 
     Args:
         side: rays along each side in the last part of the run, and in pictures from then on; 1: one through the center.
@@ -43,7 +43,7 @@ class Subpixels(Part):
 
     @property
     def replays(self) -> bool:  # type: ignore[override]
-        """Whether the number of rays stays as it is."""
+        """Whether the number of rays is constant."""
         return self.side == 1
 
     def __init__(self, side: int = 1, start: float = 0.0):
@@ -52,9 +52,9 @@ class Subpixels(Part):
             {"subpixels": side, "subpixels_from": start}, {"subpixels": (1, MOST_PER_SIDE), "subpixels_from": (0, 1)}
         )
         self.side, self.start = side, start
-        self._now = 1  # as in the buffer, which is not read at each step
+        self._now = 1  # mirrors the buffer, which is not read at each step
         if side > 1:
-            # In the checkpoint, so that its pictures are made as the last step was.
+            # In the checkpoint, so that it renders as the last step did.
             self.register_buffer("now", torch.ones((), dtype=torch.int64))
 
     @property
@@ -68,7 +68,7 @@ class Subpixels(Part):
         return self._now**2
 
     def offsets(self, device: torch.device | str = "cpu") -> Float[Tensor, "per_pixel 2"]:
-        """Return where in a pixel its rays go through, in pixels from its center (x, y), row by row.
+        """Return the positions of a pixel's rays, in pixels from its center (x, y), row by row.
 
         >>> halves = Subpixels(2)
         >>> halves.on_step(StepContext(progress=0.9, step=9, key=0))
@@ -79,18 +79,18 @@ class Subpixels(Part):
         return torch.cartesian_prod(along, along).view(-1, 2).flip(-1)
 
     def on_step(self, context: StepContext) -> None:
-        """Take several rays a pixel from `start` on."""
+        """Use several rays per pixel from `start` on."""
         self._set(self.side if context.progress >= self.start else 1)
 
     def reset_parameters(self) -> None:
-        """Begin with one ray through each pixel's center."""
+        """Reset to one ray through each pixel's center."""
         self._set(1)
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: a number of rays that was never asked for.
+            InputError: an impossible number of rays.
         """
         if self.side > 1:
             if int(self.now) not in (1, self.side):
@@ -104,19 +104,19 @@ class Subpixels(Part):
 
 
 class RayGenerator(Part):
-    """Make the rays through pixels of views, on the device that it was moved to.
+    """Generate the rays through pixels of views, on the module's device.
 
-    It is a module so that cameras may be learned: they are a function of the parameters of its refinement. What it is
-    given is data, and stands in no checkpoint's weights.
+    It is a module so that cameras may be learned: they are a function of its refinement's parameters. Its arguments are
+    data, and not part of a checkpoint's weights.
 
     Args:
         cameras: one per view.
         near: distance at which the rays of each view begin, scene units.
-        far: where they end.
-        refinement: what learns of the cameras; None: nothing.
-        capture_of: number of the capture that each view belongs to, where several were joined; None: one.
-        names_photographs: whether rays say whose pixels they belong to outside of training, too: for models that look
-            at photographs, and not at the very one that is asked for.
+        far: distance at which they end.
+        refinement: the learned change of the cameras; None: nothing is learned.
+        capture_of: number of each view's capture, if several were joined; None: one.
+        names_photographs: whether rays name their photograph outside training, too: for models that render from
+            photographs, except from the very one that is requested.
     """
 
     refinement: Refinement | None
@@ -147,28 +147,28 @@ class RayGenerator(Part):
     def of_views(
         cls, scene: SceneRecord, names_photographs: bool, refinement: Refinement | None = None
     ) -> "RayGenerator":
-        """Return what makes the rays through a scene's own views."""
+        """Return the generator of rays through a scene's own views."""
         return cls(scene.cameras, scene.near, scene.far, refinement, scene.capture_of, names_photographs)
 
     @torch.no_grad()
     def at_most(self, longest: int) -> "RayGenerator":
-        """Return what makes the rays of smaller pictures, whose longer sides are no longer than this, in pixels."""
+        """Return the generator for smaller pictures, whose longer side has at most `longest` pixels."""
         captures = None if self.capture_of is None else self.capture_of.tolist()
         return RayGenerator(at_most(self.cameras, longest), self.near, self.far, None, captures, self.names_photographs)
 
     @property
     def cameras(self) -> Cameras:
-        """The cameras that rays start from, as they have been learned so far."""
+        """The cameras that rays start from, as learned so far."""
         return self.given if self.refinement is None else self.refinement(self.given)
 
     @property
     def learns_cameras(self) -> bool:
-        """Whether anything is learned of them."""
+        """Whether anything about them is learned."""
         return self.refinement is not None and self.refinement.moves()
 
     @property
     def given(self) -> Cameras:
-        """The cameras as they were before anything was learned."""
+        """The cameras before anything was learned."""
         return Cameras(lens_model=self.lens_model, **{name: getattr(self, name) for name in MOVED})
 
     def forward(
@@ -177,9 +177,9 @@ class RayGenerator(Part):
         """Return the rays through pixels, in the world or in normalized device coordinates.
 
         Args:
-            pixels: which.
-            subpixel_offset: from the center of its pixel to where each ray passes, in pixels (x, y); None: none.
-            per_side: so many rays share each side of a pixel.
+            pixels: the pixels.
+            subpixel_offset: each ray's offset from the center of its pixel, in pixels (x, y); None: none.
+            per_side: number of rays along each side of a pixel.
         """
         rays = rays_through_pixels(self.cameras, pixels, self.near, self.far, subpixel_offset, per_side)
         if self.capture_of is not None:
@@ -187,7 +187,7 @@ class RayGenerator(Part):
         return replace(rays, photograph=pixels.view) if self.names_photographs else rays
 
     def of_pixels(self, pixels: PixelIndex, subpixels: Subpixels) -> RayBundle:
-        """Return the rays of pixels in a row, as many for each as a model wants, those of one pixel after the other."""
+        """Return the rays of consecutive pixels, pixel by pixel, as many for each as `subpixels` says."""
         if subpixels.per_pixel == 1:
             return self(pixels)
         subpixel_offset = subpixels.offsets(pixels.x.device).repeat(pixels.x.numel(), 1)
@@ -195,7 +195,7 @@ class RayGenerator(Part):
         return self(each, subpixel_offset, subpixels.per_side)
 
     def refined(self, trained: Sequence[int]) -> Cameras | None:
-        """Return the cameras as learned, the others aligned with them, on the CPU; None where none learns.
+        """Return the cameras as learned, with the others aligned to them, on the CPU; None if none learns.
 
         Args:
             trained: numbers of the views that are trained on.
@@ -209,9 +209,9 @@ class RayGenerator(Part):
     def distance_along(
         self, pixels: PixelIndex, distance: Float[Tensor, "*rays"]
     ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"] | None]:
-        """Return where along the rays of `forward` points lie that have a distance in the world, and where those end.
+        """Return the distances along rays of `forward` of points at distances in the world, and where these rays end.
 
-        The end is that of normalized device coordinates, which is infinitely far away; else None.
+        The end is that of normalized device coordinates, which is infinitely far away in the world; else None.
         """
         if self.ndc is None:
             return distance, None
@@ -219,17 +219,17 @@ class RayGenerator(Part):
         return share_at_distance(self.through_world(pixels), distance) * far, far
 
     def through_world(self, pixels: PixelIndex, subpixel_offset: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
-        """Return the rays through the world, wherever those of `forward` run."""
+        """Return the rays through the world, even if those of `forward` are in normalized device coordinates."""
         return rays_through_pixels(replace(self.cameras, ndc=None), pixels, self.near, self.far, subpixel_offset)
 
 
 def for_each_ray(of_pixel: Shaped[Tensor, "pixels *of"], per_pixel: int) -> Shaped[Tensor, "rays *of"]:
-    """Return what each ray has of its pixel: rays of one pixel lie one after the other."""
+    """Repeat each pixel's values for its rays; the rays of a pixel are consecutive."""
     return of_pixel if per_pixel == 1 else of_pixel.repeat_interleave(per_pixel, dim=0)
 
 
 def random_of_rays(random: RayRandom, per_pixel: int) -> RayRandom:
-    """Return random numbers for each ray of pixels; for one ray a pixel those of the pixel."""
+    """Return random numbers for each ray of pixels; with one ray per pixel, those of the pixel."""
     if per_pixel == 1:
         return random
     number = torch.arange(per_pixel, device=random.slots.device)
@@ -238,7 +238,7 @@ def random_of_rays(random: RayRandom, per_pixel: int) -> RayRandom:
 
 
 def mean_over_pixels(rendering: Rendering, per_pixel: int) -> Rendering:
-    """Return what pixels show: the means over their rays, and no samples."""
+    """Return what pixels show: the means over their rays, without samples."""
     if per_pixel == 1:
         return rendering
     plain = Rendering(**{each.name: getattr(rendering, each.name) for each in fields(Rendering)})

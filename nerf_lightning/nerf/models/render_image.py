@@ -26,7 +26,7 @@ from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 WHOLE_RAYS = 4096
-"""Of a tile, where kernels take rays from end to end: what they have under way stays in their caches anyway."""
+"""Rays per tile, if kernels process whole rays: what they are processing stays in the caches anyway."""
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +40,9 @@ class Picture(TensorStruct):
     """Expected distance along the ray; light that escapes ends at far."""
     opacity: Float[Tensor, "*pixels"]
     first_rgb: Float[Tensor, "*pixels 3"] | None = None
-    """What the first level sees that makes pictures, where it is not the last."""
+    """The picture of the first level that makes one, if it is not the last."""
     channels: dict[str, Float[Tensor, "*pixels _"]] = field(default_factory=dict)
-    """What else the field says, by name (`Rendering.channels`)."""
+    """The field's other outputs, by name (`Rendering.channels`)."""
 
 
 @torch.no_grad()
@@ -59,12 +59,12 @@ def render_picture(
 
     Args:
         model: in evaluation mode.
-        rays_of: the cameras, the one of this view among them.
+        rays_of: the cameras, including the one of this view.
         view: its number.
-        background: what lies behind the scene.
-        tile_points: most points that go through a field at once.
-        clip: what of the scene is shown; None: all.
-        seen_from: other cameras, from whose directions the color is looked up, in place of the view's own.
+        background: what is behind the scene.
+        tile_points: maximum number of points that go through a field at once.
+        clip: the part of the scene that is shown; None: all.
+        seen_from: other cameras, whose directions determine the color instead of the view's own.
     """
     cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
 
@@ -82,7 +82,7 @@ def render_picture(
 
     def render(part: slice) -> Picture:
         pixels = quads_between(cameras, view, part)
-        first, *others = subpixels.offsets() if subpixels.per_pixel > 1 else (None,)  # a kernel knows of no offsets
+        first, *others = subpixels.offsets() if subpixels.per_pixel > 1 else (None,)  # kernels do not support offsets
         total = through(first, pixels)
         for offset in others:
             total = _sum(total, through(offset, pixels))
@@ -103,15 +103,15 @@ def view_rays(
 ) -> tuple[RayBundle, RayBundle]:
     """Return the rays of pixels as the model takes them, and the same rays through the world.
 
-    They are where the cameras are; on the CPU where they are clipped. They take 60 times as much memory as the pixels
-    of a photograph: ask for a tile of a picture at a time.
+    They are on the cameras' device, or on the CPU if clipped. They take 60 times as much memory as the pixels of a
+    photograph: request a tile of a picture at a time.
 
     Args:
         rays_of: the cameras.
-        pixels: which.
-        clip: what of the scene is shown; None: all.
-        subpixel_offset: from the center of each pixel to where its ray passes, in pixels (x, y); None: none.
-        per_side: so many rays share each side of a pixel.
+        pixels: the pixels.
+        clip: the part of the scene that is shown; None: all.
+        subpixel_offset: each ray's offset from the center of its pixel, in pixels (x, y); None: none.
+        per_side: number of rays along each side of a pixel.
     """
     subpixel_offset = None if subpixel_offset is None else subpixel_offset.to(pixels.x.device)
     rays, bent = rays_of(pixels, subpixel_offset, per_side), rays_of.ndc is not None
@@ -127,15 +127,15 @@ def view_rays(
 def picture_surface(
     rays_of: RayGenerator, view: int, picture: Picture, clip: Clip | None = None
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width 3"]]:
-    """Return the distance at which the light of each pixel was stopped, and where in the world that is; on the CPU.
+    """Return the distance at which the light of each pixel was stopped, and that point in the world; on the CPU.
 
-    In normalized device coordinates light that escapes has no distance that could be taken out.
+    In normalized device coordinates, light that escapes has no distance that could be removed.
 
     Args:
         rays_of: the cameras that the picture was rendered through.
-        view: which of them.
-        picture: what was rendered.
-        clip: what of the scene it shows; None: all.
+        view: index of the view.
+        picture: the rendered picture.
+        clip: the part of the scene that it shows; None: all.
     """
     cameras = rays_of.cameras
     depth, opacity = picture.depth.flatten(), picture.opacity.flatten()
@@ -150,10 +150,10 @@ def picture_surface(
 
 @torch.no_grad()
 def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> Picture:
-    """Return what rays see, as at evaluation, on the CPU.
+    """Render rays as at evaluation, and return the result on the CPU.
 
-    Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
-    Rays that share (`together`) are not cut apart.
+    Depth is in the rays' units. Rays of which nothing is left (far is not beyond near) see the background. Rays that
+    share samples (`together`) are not separated.
     """
     device = next(model.parameters()).device
 
@@ -166,9 +166,9 @@ def render_rays(model: Model, rays: RayBundle, background: Background, tile_poin
 def _in_tiles(
     model: Model, count: int, tile_points: int, render: Callable[[slice], Picture], together: int = 1
 ) -> Picture:
-    """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory.
+    """Return what `render` sees of `count` rays, tile by tile, with ever smaller tiles if memory runs out.
 
-    Tiles are not cut between rays that come together.
+    Tiles do not separate rays that belong together.
     """
     at_once = tile_rays_for(model, tile_points)
     if model.takes_whole_rays(next(model.parameters()).device, training=False):
@@ -188,7 +188,7 @@ def _in_tiles(
 
 
 def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture], together: int) -> Picture:
-    # Made once: thousands of small results between what comes and goes would leave holes many times their size.
+    # Allocated once: thousands of small results among temporaries would fragment memory to many times their size.
     first_rgb = None if model.first_picture is None else torch.empty(count, 3)
     picture, making = Picture(torch.empty(count, 3), torch.empty(count), torch.empty(count), first_rgb), Lock()
 
@@ -204,7 +204,7 @@ def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Pict
             picture.channels[name][part] = values
 
     threads = threads_on(next(model.parameters()).device)
-    if threads > 1:  # small pictures, too, are shared out
+    if threads > 1:  # share small pictures among threads, too
         at_once = min(at_once, max(FEWEST_ROWS, -(-count // (PARTS_PER_THREAD * threads))))
     parts = list(tiles(count, at_once, together, multiple=threads))
     if threads > 1:

@@ -1,4 +1,4 @@
-"""Tiles: a batch of rays goes through a model in parts, so that what is kept of them stays small."""
+"""Tiles: a batch of rays goes through a model in parts, to limit memory."""
 
 from collections.abc import Iterator
 
@@ -14,13 +14,14 @@ from nerf_lightning.nerf.types.scene import Background
 
 
 def tiles(num_rays: int, tile_rays: int, together: int = 1, multiple: int = 1) -> Iterator[slice]:
-    """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
+    """Return the slices that cut a batch into tiles of at most `tile_rays`, as equal in size as possible.
 
     Args:
-        num_rays: of the batch.
-        tile_rays: most rays of a tile.
-        together: so many rays in a row are never cut; a tile has as many at least.
-        multiple: the number of tiles is one of its multiples, where there are so many rays: threads have as many each.
+        num_rays: number of rays of the batch.
+        tile_rays: maximum number of rays per tile.
+        together: this many consecutive rays are never separated; the minimum number per tile.
+        multiple: the number of tiles is a multiple of this, if there are enough rays, so that threads have equal
+            numbers.
 
     >>> [(part.start, part.stop) for part in tiles(10, 4)]
     [(0, 4), (4, 7), (7, 10)]
@@ -44,34 +45,34 @@ def tile_rays_for(model: Model, tile_points: int, training: bool = False) -> int
 
 
 def pixels_in_tile(model: Model, tile_points: int, training: bool = False) -> int:
-    """Return how many pixels' rays make such a tile, at least one."""
+    """Return how many pixels' rays make a tile of about `tile_points` points, at least one."""
     return max(1, tile_rays_for(model, tile_points, training) // model.subpixels.per_pixel)
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:
-    """Return whether there was no room for a tensor; smaller tiles may find it."""
+    """Return whether memory ran out for a tensor; smaller tiles may fit."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def is_device_failure(error: BaseException) -> bool:
-    """Return whether the GPU itself has failed: whatever lay on it is lost, and the process can no longer use it."""
+    """Return whether the GPU itself has failed: its content is lost, and the process can no longer use it."""
     return isinstance(error, torch.AcceleratorError) or str(error).startswith(("CUDA error", "Triton Error [CUDA]"))
 
 
 def weighted_renderings(
     model: Model, rays: RayBundle, background: Background, key: int, tile_points: int
 ) -> Iterator[tuple[RayBundle, list[DenseRendering | RaggedRendering]]]:
-    """Render rays as a training step does, without its gradients: tile by tile, each with what every level saw.
+    """Render rays as a training step does, but without gradients: tile by tile, each with every level's rendering.
 
-    With random numbers a level that leaves out what is empty keeps its weights, which it does not in plain rendering.
-    What levels count in training steps is put back at the end.
+    With random numbers, a level that skips empty space keeps its weights, which it does not in plain rendering. The
+    levels' counts of training steps are restored at the end.
 
     Args:
         model: the levels, on the rays' device.
         rays: scene units.
-        background: what lies behind them.
-        key: of the random numbers.
-        tile_points: most points that go through a field at once.
+        background: what is behind them.
+        key: key of the random numbers.
+        tile_points: maximum number of points that go through a field at once.
     """
     count = rays.near.numel()
     random = batch_random(key, count, rays.near.device)

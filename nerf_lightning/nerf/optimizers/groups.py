@@ -1,4 +1,4 @@
-"""Groups of parameters: tables do not decay, and parts may learn at rates of their own."""
+"""Parameter groups: tables do not decay, and parts may have their own learning rates."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -14,10 +14,10 @@ BuildOptimizer = Callable[[Iterable[Any]], Optimizer]
 
 
 def optimizer_of(module: nn.Module, build: BuildOptimizer) -> Optimizer:
-    """Return the optimizer of all that learns; the tables of encoders and what has its own rate do not decay.
+    """Return the optimizer of all parameters; the encoders' tables and parts with their own rate do not decay.
 
     Raises:
-        InputError: a setting of the optimizer that it refuses.
+        InputError: the optimizer refuses a setting.
     """
     tables = tables_of(module)
     groups: list[dict[str, Any]] = [{"params": tables, "weight_decay": 0.0}] if tables else []
@@ -30,5 +30,5 @@ def optimizer_of(module: nn.Module, build: BuildOptimizer) -> Optimizer:
     groups.insert(0, {"params": [each for each in module.parameters() if id(each) not in known]})
     try:
         return build(groups)
-    except (ValueError, TypeError) as error:  # torch looks at its settings here
+    except (ValueError, TypeError) as error:  # torch checks its settings here
         raise InputError(f"The optimizer refuses its settings: {error}. Fix optimizer.*, or leave it out.") from error

@@ -1,4 +1,4 @@
-"""Schedules: the learning rate as a function of the step alone, so there is no state to lose."""
+"""Schedules: the learning rate as a function of only the step, so there is no state to lose."""
 
 from abc import ABC, abstractmethod
 
@@ -8,9 +8,9 @@ class Schedule(ABC):
 
     @abstractmethod
     def __call__(self, step: int, num_steps: int) -> float:
-        """Return the factor for the step that is about to be taken (0 is the first of an attempt).
+        """Return the factor for the next step (0 is the first of an attempt).
 
-        `num_steps` is the length of the run; a run that is made longer stretches its schedule.
+        `num_steps` is the length of the run; extending a run stretches its schedule.
         """
 
 
@@ -39,10 +39,10 @@ class ExponentialDecay(Schedule):
 
 
 class Cooldown(Schedule):
-    """The whole rate at first, then a straight line to zero (arXiv 2405.18392), times the rise while warming up.
+    """Full rate at first, then linear decay to zero (arXiv 2405.18392), times a linear warm-up.
 
-    A rate that stays high goes farther in a short run than one that falls from the beginning, and the line to zero
-    takes the noise out that it leaves.
+    A rate that stays high gets farther in a short run than one that decays from the beginning, and the decay to zero
+    removes the noise that it leaves.
 
     Args:
         cooldown: share of the run, at its end, in which the rate decays.

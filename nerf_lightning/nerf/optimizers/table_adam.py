@@ -15,9 +15,9 @@ from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
 class TableAdam(Optimizer):
     """Adam (arXiv 1412.6980) that skips entries whose gradient is exactly zero, in one pass over memory.
 
-    A batch touches a small part of a hash grid's tables; updating the moments of all the rest would cost more than
-    the batch, and would let entries drift on old momentum. Gradients are kept allocated and are added to in place
-    (`grad_in_place`); the pass that uses them sets them back to zero.
+    A batch touches a small part of a hash grid's tables; updating the moments of the rest would cost more than the
+    batch, and let entries drift on old momentum. Gradients stay allocated and are accumulated in place
+    (`grad_in_place`); the pass that uses them resets them to zero.
 
     Args:
         params: parameters or groups of them.
@@ -42,11 +42,11 @@ class TableAdam(Optimizer):
                 "and eps, betas from 0 to below 1, and no negative weight_decay."
             )
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps, "weight_decay": weight_decay})
-        # Shared with whatever copies this optimizer's attributes, as Lightning's wrapper does.
+        # Shared with copies of this optimizer's attributes, such as Lightning's wrapper.
         self._gradients = {"are_zero": False}
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Set the gradients to zero where the last step has not; they stay allocated whatever is asked for."""
+        """Set the gradients to zero unless the last step has; they stay allocated, whatever `set_to_none`."""
         for parameter in self._parameters():
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)

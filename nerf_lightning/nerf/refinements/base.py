@@ -1,4 +1,4 @@
-"""The contract of a refinement: cameras in, cameras out, as a function of parameters that learn with the model."""
+"""The contract of a refinement: cameras in, cameras out, as a function of parameters learned with the model."""
 
 from abc import ABC, abstractmethod
 
@@ -7,18 +7,18 @@ from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 
 class Refinement(Part, ABC):
-    """Cameras that learn: where they start from, every parameter is zero and nothing is changed."""
+    """Cameras that learn: initially every parameter is zero and nothing is changed."""
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the cameras and of the scene's extent, once, before training.
+        """Record the cameras and the scene's extent, once, before training.
 
         Raises:
-            InputError: a scene whose cameras cannot be learned.
+            InputError: the scene's cameras cannot be learned.
         """
 
     @abstractmethod
     def forward(self, cameras: Cameras) -> Cameras:
-        """Return the cameras as they have been learned so far."""
+        """Return the cameras as learned so far."""
 
     def moves(self) -> bool:
         """Return whether there is anything to learn."""
@@ -26,7 +26,7 @@ class Refinement(Part, ABC):
 
 
 class NoRefinement(Refinement):
-    """Leave the cameras as they were read."""
+    """Leave the cameras unchanged."""
 
     def forward(self, cameras: Cameras) -> Cameras:
         """Return the same cameras."""

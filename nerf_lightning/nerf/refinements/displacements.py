@@ -1,4 +1,4 @@
-"""What refined cameras say of those beside them: where views that were not trained on go, and who moved far."""
+"""What refined cameras imply: where views that were not trained on move to, and which cameras moved far."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,16 +11,16 @@ from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
 from nerf_lightning.nerf.types.scene import Cameras
 
 FAR = 5.0
-"""So many times the median is far to have moved."""
+"""Cameras that moved more than this many times the median moved far."""
 LEAST_FAR = 5e-3
-"""What is less is never far: radians, or shares of the scene's extent."""
+"""Smaller motions are never far: radians, or shares of the scene's extent."""
 
 
 def align_untrained_cameras(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
-    """Return the cameras as learned, and those that were not trained on where the trained ones have gone as a whole.
+    """Return the cameras as learned, with those that were not trained on moved by the trained ones' overall motion.
 
-    Nothing in the photographs says where the scene is, how large, or turned how, so all trained cameras may have
-    drifted alike: the others follow by the similarity between the trained ones before and after.
+    The photographs do not determine the scene's position, size and rotation, so all trained cameras may have drifted
+    together: the others follow by the similarity between the trained ones before and after.
     """
     rows = list(trained)
     c2w = carried(given.c2w, similarity_between(given.c2w[rows], learnt.c2w[rows]))
@@ -31,9 +31,9 @@ def align_untrained_cameras(given: Cameras, learnt: Cameras, trained: Sequence[i
 def camera_displacements(
     given: Cameras, learnt: Cameras, trained: Sequence[int], extent: float
 ) -> Float[Tensor, "trained"]:
-    """Return how far each trained camera has moved, beside what all have moved as one.
+    """Return how far each trained camera has moved, apart from the motion of all.
 
-    It is the angle that it has turned by (radians) plus its shift over the scene's extent.
+    This is its rotation angle (radians) plus its shift divided by the scene's extent.
     """
     rows = list(trained)
     before = carried(given.c2w[rows], similarity_between(given.c2w[rows], learnt.c2w[rows])).double()
@@ -45,7 +45,7 @@ def camera_displacements(
 
 
 def far_displaced(motion: Float[Tensor, "trained"]) -> list[int]:
-    """Return the places of those that moved several times as far as most, the farthest first.
+    """Return the indices of cameras that moved much farther than most, the farthest first.
 
     >>> far_displaced(torch.tensor([0.01, 0.012, 0.2, 0.009]))
     [2]

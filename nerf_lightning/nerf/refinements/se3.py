@@ -21,20 +21,20 @@ FEWEST_PHOTOGRAPHS = 2
 
 
 class SE3Delta(Refinement):
-    """Shift and turn each camera by a little: SO(3) x R^3, by the exponential map.
+    """Shift and rotate each camera slightly: SO(3) x R^3, by the exponential map.
 
     R' = R exp(w + (-s_y, s_x, 0) / d), c' = c + R s with s = e t, f' = f exp(g), k1' = k1 + h1, k2' = k2 + h2. The
-    vector w turns the camera about its own axes (radians); the shift t, along them, is in units of the scene's extent e
-    (half the diagonal of its box). All photographs of one camera share g and h, which belong to its focal length and to
-    the radial coefficients of its lens; what is given as a pinhole may turn out to have one. All are zero at first. A
-    photograph that is not trained on has no gradients, and stays where it is.
+    vector w rotates the camera about its own axes (radians); the shift t, along them, is in units of the scene's extent
+    e (half the diagonal of its box). All photographs of one camera share g and h, the changes of its focal length and
+    of the radial coefficients of its lens; a camera given as a pinhole may turn out to have a lens. All are zero
+    initially. A photograph that is not trained on has no gradients, and does not move.
 
-    To turn and to shift sideways move a picture all but alike, and an optimizer that takes each number by itself
-    wavers between the two. So a shifted camera turns back to what lies at the distance d of the scene's middle: w is
-    where the picture lies, and t what of it is parallax.
+    Rotating and shifting sideways move a picture almost alike, and an optimizer that treats each number separately
+    wavers between the two. So a shifted camera turns back to what is at the distance d of the scene's middle: w is the
+    picture's displacement, and t its parallax.
 
-    The loss does not change where all cameras and the whole scene move as one (turn, shift, grow); the penalty keeps
-    them from drifting that way.
+    The loss does not change if all cameras and the whole scene move together (rotation, shift, scale); the penalty
+    keeps them from drifting that way.
 
     Args:
         poses: refine the rotation and translation of each camera (w and t).
@@ -68,15 +68,15 @@ class SE3Delta(Refinement):
         self.is_held = False
 
     def on_step(self, context: StepContext) -> None:
-        """Let the cameras go when it is time."""
+        """Release the cameras when it is time."""
         self.is_held = context.progress < self.hold
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the cameras and of the scene's extent, once, before training.
+        """Record the cameras and the scene's extent, once, before training.
 
         Raises:
-            InputError: rays run through normalized device coordinates, there are too few photographs, or more of
-                panoramas than their poses is to be learned.
+            InputError: rays are in normalized device coordinates, there are too few photographs, or more than the poses
+                of panoramas is to be learned.
         """
         if scene.cameras.ndc is not None:
             raise InputError(
@@ -98,7 +98,7 @@ class SE3Delta(Refinement):
         self.learn(scene.cameras, scene.aabb, photographs)
 
     def learn(self, cameras: Cameras, aabb: Float[Tensor, "2 3"], photographs: int) -> None:
-        """Make room for what is learned of cameras; `photographs` of them are trained on, the box holds content."""
+        """Allocate the parameters of cameras; `photographs` of them are trained on, and the box contains the scene."""
         views = len(cameras.width)
         extent = (aabb[1] - aabb[0]).norm() / 2.0
         ahead = -((aabb.mean(dim=0) - cameras.c2w[:, :, 3]) * cameras.c2w[:, :, 2]).sum(dim=1)
@@ -117,7 +117,7 @@ class SE3Delta(Refinement):
 
     @disable_autocast
     def forward(self, cameras: Cameras) -> Cameras:
-        """Return the cameras as they have been learned so far."""
+        """Return the cameras as learned so far."""
         if self.is_held:
             return cameras
         if self.poses:
@@ -134,13 +134,13 @@ class SE3Delta(Refinement):
         return cameras
 
     def penalty(self) -> Float[Tensor, ""] | None:
-        """Return the sum of the squared changes over the number of photographs, weighted."""
+        """Return the weighted sum of squared changes, divided by the number of photographs."""
         if not self.weight:
             return None
         squares = [parameter.square().sum() for parameter in self.parameters()]
         return self.weight / self.photographs * torch.stack(squares).sum()
 
     def reset_parameters(self) -> None:
-        """Put every camera back."""
+        """Reset every camera."""
         for parameter in self.parameters():
             nn.init.zeros_(parameter)

@@ -1,4 +1,4 @@
-"""The background, decided in one place: what lies behind a ray, and what a photograph shows in front of it.
+"""The background, decided in one place: what is behind a ray, and what a photograph shows in front of it.
 
 A rendered ray is composited over it where its sums become a `Rendering` (`from_sums`, `from_light`).
 """
@@ -14,7 +14,8 @@ from nerf_lightning.nerf.row_chunks import row_chunks
 from nerf_lightning.nerf.types.scene import DRAWN, UNSURE, Background, Scene
 
 LEAST_OPACITY = 1e-2
-"""Of a ray whose color can be told from the background's: below it, divided by this, it counts for less."""
+"""Minimum opacity at which a ray's color is distinguishable from the background's: below it, the color is divided by
+this, and counts for less."""
 
 
 def background_colors(
@@ -24,14 +25,14 @@ def background_colors(
     random: RayRandom | None,
     rgba: Float[Tensor, "rays 4"] | None = None,
 ) -> Float[Tensor, "rays 3"] | None:
-    """Return the color behind each ray, or None where the ray is closed.
+    """Return the color behind each ray, or None if rays are closed.
 
     Args:
-        background: which; those that are drawn anew are so while training alone.
-        num_rays: how many.
-        device: where the colors are wanted.
-        random: the step's numbers; None (evaluation, rendering) stands for the color of evaluation.
-        rgba: the pixels that are trained on, of which `UNSURE` ones keep the color of evaluation behind them.
+        background: the kind; random ones are drawn only in training.
+        num_rays: number of rays.
+        device: device of the colors.
+        random: the step's random numbers; None (evaluation, rendering) selects the color of evaluation.
+        rgba: the training pixels, of which `UNSURE` ones keep the color of evaluation behind them.
     """
     if background == "none":
         return None
@@ -45,7 +46,7 @@ def background_colors(
 
 
 def at_evaluation(background: Background) -> Background:
-    """Return what lies behind the scene where nothing is drawn.
+    """Return the background of evaluation, where nothing is drawn at random.
 
     >>> at_evaluation("random"), at_evaluation("black_or_random")
     ('white', 'black')
@@ -58,7 +59,7 @@ def at_evaluation(background: Background) -> Background:
 def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] | None) -> Float[Tensor, "*rays 3"]:
     """Return straight-alpha colors over a background: rgb * a + background * (1 - a).
 
-    Without a background the colors are taken as they are.
+    Without a background the colors are unchanged.
 
     >>> blend(torch.tensor([1.0, 0.0, 0.0, 0.25]), torch.ones(3))
     tensor([1.0000, 0.7500, 0.7500])
@@ -77,8 +78,8 @@ def in_other_light(
     """Return rendered colors after a change of the scene's own light; the background behind it keeps its color.
 
     Args:
-        change: takes straight colors, as of opaque pixels, to changed ones.
-        rgb: over the background.
+        change: maps straight colors, as of opaque pixels, to changed ones.
+        rgb: colors over the background.
         foreground: the scene's own light in them, sum of weights times color.
         opacity: sum of weights.
     """

@@ -1,4 +1,4 @@
-"""Histograms along a ray: inverse transform sampling from piecewise constant densities.
+"""Histograms along a ray: inverse transform sampling of piecewise constant densities.
 
 Letters: `edges` are bins + 1 increasing fenceposts, `weights` the mass of each bin, `u` uniform numbers in [0, 1).
 """
@@ -24,11 +24,11 @@ def sample_histogram(
 
     Args:
         edges: fenceposts; exactly one more than there are weights.
-        weights: mass of each bin, need not sum to one.
-        u: numbers in [0, 1), in order.
+        weights: mass of each bin; need not sum to one.
+        u: sorted numbers in [0, 1).
         floor: mass added to each bin, so that an empty ray is sampled evenly and no bin has zero width in the
             distribution.
-        contracted: whether the mass of a bin is spread evenly over `normalized_distance`, and not over the distance.
+        contracted: whether the mass of a bin is uniform in `normalized_distance` instead of in distance.
 
     >>> sample_histogram(torch.tensor([0.0, 1, 2]), torch.tensor([0.0, 1]), torch.tensor([0.5]), floor=0.0)
     tensor([1.5000])

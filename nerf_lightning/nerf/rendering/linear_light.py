@@ -1,7 +1,7 @@
-"""Light that is scaled, in colors that are encoded for a screen (sRGB, IEC 61966-2-1).
+"""Scaling light in encoded colors (sRGB, IEC 61966-2-1).
 
 Letters: encoded color x, linear light v, gain g. v = x / 12.92 up to x = 0.04045, ((x + 0.055) / 1.055)^2.4 above.
-Both curves are used beyond [0, 1], too: the straight one below 0, the power above 1.
+The curves extend beyond [0, 1]: the linear one below 0, the power above 1.
 """
 
 import torch
@@ -25,12 +25,12 @@ def to_linear(rgb: Float[Tensor, "*colors"]) -> Float[Tensor, "*colors"]:
 def scale_light(rgb: Float[Tensor, "*colors"], gain: Float[Tensor, "*#colors"]) -> Float[Tensor, "*colors"]:
     """Return the encoded colors of g times the light of encoded colors, x(g v(x)).
 
-    Where both colors lie on the power's part that is s (x + 0.055) - 0.055 with s = g^(1/2.4), and where both lie on
-    the straight one g x: so written, a gain of 1 changes no bit, neither of the colors nor of their gradients.
+    If both colors are on the power's part, this is s (x + 0.055) - 0.055 with s = g^(1/2.4), and if both are on the
+    linear part, g x: written this way, a gain of 1 changes no bit of the colors or their gradients.
 
     Args:
-        rgb: encoded; in [0, 1], or beyond.
-        gain: of the light, > 0.
+        rgb: encoded colors, in [0, 1] or beyond.
+        gain: factor on the light, > 0.
 
     >>> scale_light(torch.tensor([0.25, 0.5]), torch.tensor(2.0))
     tensor([0.3521, 0.6858])

@@ -1,4 +1,4 @@
-"""Gradients made smaller near cameras, against floaters (Philip and Deschaintre, EGSR 2023, arXiv 2305.02756)."""
+"""Gradients scaled down near cameras, against floaters (Philip and Deschaintre, EGSR 2023, arXiv 2305.02756)."""
 
 from typing import Any
 
@@ -12,15 +12,15 @@ from nerf_lightning.nerf.types.renderings import FieldOutput
 def soften_near_gradients(
     output: FieldOutput, distance: Float[Tensor, "*rays samples"], whole_from: float
 ) -> FieldOutput:
-    """Return the same values, whose gradients are multiplied by min(1, (distance / whole_from)^2).
+    """Return the same values, with gradients multiplied by min(1, (distance / whole_from)^2).
 
-    The volume that a camera's pixels share is small near it, so points there receive as many gradients from one
-    photograph as those farther away do from all: matter grows before a camera, which no other photograph contradicts.
+    A camera's pixels share a small volume near it, so points there receive as many gradients from one photograph as
+    those farther away do from all: matter grows in front of a camera, and no other photograph contradicts it.
 
     Args:
         output: density and color of samples.
-        distance: from the camera, scene units.
-        whole_from: from this distance on gradients are whole, > 0.
+        distance: distance from the camera, scene units.
+        whole_from: distance from which on gradients are whole, > 0.
     """
     share = (distance.detach() / whole_from).square().clamp(max=1.0)
     channels = {name: _Scaled.apply(each, share[..., None]) for name, each in output.channels.items()}

@@ -2,7 +2,7 @@
 
 Letters: sigma_i density of interval i, delta_i its length, alpha_i = 1 - exp(-sigma_i delta_i) what it absorbs,
 T_i = exp(-sum_{j<i} sigma_j delta_j) the light that reaches its start, w_i = T_i alpha_i. Samples are the last axis.
-The kernels in `kernels/ragged` and `kernels/render` compute the same, and have to change with it.
+The kernels in `kernels/ragged` and `kernels/render` compute the same, and must change with it.
 """
 
 import torch
@@ -32,7 +32,7 @@ def weights_from_density(
 
 
 def closed_weights(weights: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
-    """Give the last interval all the light that is left, for scenes without a background.
+    """Let the last interval absorb all remaining light, for scenes without a background.
 
     >>> closed_weights(torch.tensor([0.5, 0.25, 0.125]))
     tensor([0.5000, 0.2500, 0.2500])
@@ -52,7 +52,7 @@ def composite(
     Args:
         output: density and color at the samples' midpoints.
         samples: the intervals.
-        rays: where near and far stand.
+        rays: the rays, with near and far.
         background: color behind each ray; None closes the ray instead.
     """
     closed = background is None
@@ -76,7 +76,7 @@ def rendering_of(
     background: Float[Tensor, "*#rays 3"] | None,
     channels: dict[str, Tensor] | None = None,
 ) -> DenseRendering:
-    """Return what is seen, given the weights and sum of w rgb; the other arguments are those of `composite`."""
+    """Return the rendering, given the weights and the sum of w rgb; the other arguments are those of `composite`."""
     opacity, depth = weights.sum(dim=-1), (weights * samples.midpoints).sum(dim=-1)
     of_the_kind = {"weights": weights, "samples": samples, "channels": channels or {}}
     return DenseRendering.from_sums(rays, background, foreground, opacity, depth, **of_the_kind)

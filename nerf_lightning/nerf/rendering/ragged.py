@@ -1,4 +1,4 @@
-"""Volume rendering of ragged samples: the quadrature of `rendering.quadrature`, in the other layout."""
+"""Volume rendering of ragged samples: the quadrature of `rendering.quadrature` in the ragged layout."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def composite_ragged(
     Args:
         output: density and color at the samples' midpoints.
         samples: the intervals.
-        rays: where far stands.
+        rays: the rays, with far.
         background: color behind each ray; None leaves the rays open in front of black.
     """
     *sums, weights = integrate(output.density, output.rgb, samples)

@@ -1,4 +1,4 @@
-"""What the weights along rays tell: where a level sees something, and on how many samples its picture rests."""
+"""Statistics of the weights along rays: where a level sees something, and on how many samples its picture rests."""
 
 import torch
 from jaxtyping import Float, Int
@@ -12,8 +12,7 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 def effective_samples(rendering: DenseRendering | RaggedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
     """Return on how many samples each ray's light rests: (sum of weights)^2 / (sum of their squares), Kish's measure.
 
-    It is 1 where one sample has all the weight, the number of samples where all weigh the same, and 0 where none has
-    any.
+    It is 1 if one sample has all the weight, the number of samples if all weights are equal, and 0 if all are 0.
     """
     ray, _, weights = _samples_of(rendering)
     sums = torch.zeros(2, rays.near.numel(), device=weights.device)
@@ -24,13 +23,13 @@ def effective_samples(rendering: DenseRendering | RaggedRendering, rays: RayBund
 def weight_along(
     rendering: DenseRendering | RaggedRendering, rays: RayBundle, bins: int, contracted_spacing: bool = False
 ) -> Float[Tensor, "bins"]:
-    """Return how much weight lies in each of `bins` equal parts of the way from near to far, as a mean over rays.
+    """Return how much weight is in each of `bins` equal parts of the way from near to far, as a mean over rays.
 
     Args:
         rendering: what a level saw.
-        rays: along what.
+        rays: the rays.
         bins: number of parts.
-        contracted_spacing: whether the parts are equal in the spacing of space without bounds (`geometry.spacing`).
+        contracted_spacing: whether the parts are equal in the spacing of unbounded space (`geometry.contraction`).
     """
     ray, distance, weights = _samples_of(rendering)
     near, far = rays.near.reshape(-1), rays.far.reshape(-1)
@@ -43,9 +42,10 @@ def weight_along(
 
 
 def median_distances(rendering: DenseRendering | RaggedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
-    """Return where each ray has half of its weight behind it; far, where it has none.
+    """Return the distance at which each ray has accumulated half of its weight; far, if it has none.
 
-    Unlike the expected distance it lies in what the ray sees, not between the haze before a surface and the surface.
+    Unlike the expected distance, it is in what the ray sees, not between the haze in front of a surface and the
+    surface.
     """
     ray, distance, weights = _samples_of(rendering)
     ends = weights.double().cumsum(0)  # over all rays, so float32 would lose a ray's own
@@ -60,7 +60,7 @@ def median_distances(rendering: DenseRendering | RaggedRendering, rays: RayBundl
 def transmittance_at(
     rendering: DenseRendering | RaggedRendering, rays: RayBundle, distance: Float[Tensor, "rays"]
 ) -> Float[Tensor, "rays"]:
-    """Return the share of each ray's light that nothing has stopped before a distance."""
+    """Return the transmittance of each ray at a distance."""
     ray, midpoint, weights = _samples_of(rendering)
     before = torch.where(midpoint < distance.reshape(-1)[ray], weights, 0.0)
     stopped = torch.zeros(rays.near.numel(), device=weights.device).index_add_(0, ray, before)

@@ -1,4 +1,4 @@
-"""From rays and their samples to the points that a field is asked about, in both layouts."""
+"""From rays and their samples to the points at which a field is evaluated, in both layouts."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 
 
 def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None, cones: bool = False) -> Points:
-    """Return the midpoints of rays that have equally many samples: axes `*rays samples`.
+    """Return the midpoints of rays with equal numbers of samples: axes `*rays samples`.
 
     Args:
         rays: unit directions, scene units.
-        samples: where along them.
-        random: the step's numbers for these rays.
-        cones: whether the points carry the covariance of their pixel's cone, where rays know their pixel.
+        samples: the samples along them.
+        random: the step's random numbers for these rays.
+        cones: whether the points carry the covariance of their pixel's cone, if rays know their pixel.
     """
     along = samples.midpoints[..., None] * rays.directions[..., None, :]
     count = samples.edges.shape[-1] - 1
@@ -33,9 +33,9 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None,
 def ragged_points(
     rays: RayBundle, samples: RaggedSamples, random: RayRandom | None, cones: bool = False, first: int = 0
 ) -> Points:
-    """Return the midpoints of ragged samples: one axis.
+    """Return the midpoints of ragged samples, along one axis.
 
-    The arguments are those of `points_along`; `first` is the number that each ray's first sample has there.
+    The arguments are those of `points_along`; `first` is the index of each ray's first sample on its ray.
     """
     ray = samples.ray_index
 

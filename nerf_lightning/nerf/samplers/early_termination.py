@@ -1,4 +1,4 @@
-"""Early termination: what lies behind opaque samples is neither counted nor given a color."""
+"""Early termination: samples behind opaque ones are neither counted nor given a color."""
 
 import torch
 from jaxtyping import Float
@@ -16,17 +16,17 @@ from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 
 # Samples of a ray in one chunk; more where few rays are left.
 CHUNK_SAMPLES, MOST_CHUNK_SAMPLES = 6, 64
-# In rendering, samples less opaque than this keep their density and lose their color.
+# In rendering, samples less opaque than this keep their density but lose their color.
 LEAST_ALPHA = 1e-3
 
 
 def visible_samples(
     sampler: RaggedSampler, field: Field, rays: RayBundle, random: RayRandom | None
 ) -> tuple[RaggedSamples, Float[Tensor, "capacity features"] | None]:
-    """Return the samples of each ray up to where it is opaque, and the features that were computed to see that.
+    """Return the samples of each ray up to where it is opaque, and the features that were computed to find out.
 
-    Without gradients. `found` counts what is returned, and what there was no room for. Where sizes may be read on the
-    host, most hidden samples are never computed; elsewhere (CUDA graphs) the density of all is.
+    Without gradients. `found` counts the returned samples and those that did not fit. If sizes may be read on the host,
+    most hidden samples are never computed; otherwise (CUDA graphs) the density of all is.
     """
     samples, capacity = sampler(rays, random), sampler.capacity_for(rays)
     if sampler.opaque_below == 0:
@@ -96,7 +96,7 @@ def _until_opaque(
 
 
 def _visible_colors(field: Field, rays: RayBundle, samples: RaggedSamples) -> FieldOutput:
-    # Most samples are all but transparent: their color, which costs most, is not computed.
+    # Most samples are almost transparent: their color, the most expensive part, is not computed.
     points = ragged_points(rays, samples, None, field.sees_cones)
     density, features = field.density(points)
     if features is None:

@@ -1,4 +1,4 @@
-"""Importance samples where the level before saw something (Sec. 5.2, arXiv 2003.08934)."""
+"""Importance samples where the previous level saw something (Sec. 5.2, arXiv 2003.08934)."""
 
 from dataclasses import replace
 
@@ -13,11 +13,10 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
 class ImportanceSampler(DenseSampler):
-    """Add fenceposts drawn from the weights of the level before, and keep its own: the sorted union.
+    """Draw fenceposts from the weights of the previous level, and merge them with its own: the sorted union.
 
-    The histogram is that of the interior intervals (the first and last are left out, as in the paper's code, so that
-    light which a closed ray gives to its last interval draws no samples). Positions are data, not a path for
-    gradients: the weights are detached.
+    The histogram is of the interior intervals (without the first and last, as in the paper's code, so that light that a
+    closed ray assigns to its last interval draws no samples). Positions carry no gradients: the weights are detached.
 
     Args:
         num_samples: intervals added to those of the previous level.
@@ -39,10 +38,10 @@ class ImportanceSampler(DenseSampler):
         return replace(history[-1].samples, edges=torch.cat([edges, added], dim=-1).sort(dim=-1).values)
 
     def num_samples_after(self, before: int) -> int:
-        """Those of the level before, and `num_samples` more.
+        """Return the number of the previous level, plus `num_samples`.
 
         Raises:
-            ValueError: the level before has no interior interval to sample from.
+            ValueError: the previous level has no interior interval to sample from.
         """
         if before < 3:
             raise ValueError(f"importance sampling needs at least 3 samples in the level before, not {before}")

@@ -24,7 +24,7 @@ from nerf_lightning.nerf.types.scene import Scene
 log = logging.getLogger(__name__)
 
 CAPACITY = 1 << 20
-# Devices on which a number may be read on the host between two kernels while rendering.
+# Devices on which the host may read a number between two kernels while rendering.
 HOSTS = ("cpu", "cuda")
 RANGES = {
     "num_steps": (1, 1 << 20),
@@ -39,12 +39,12 @@ RANGES = {
 
 
 class OccupancySampler(RaggedSampler):
-    """Keep a moving average of the density in each cell, and sample only where it is high enough.
+    """Keep a decaying maximum of the density in each cell, and sample only where it is high enough.
 
-    Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
-    the new one, and is occupied above the smaller of half the mean and the density that makes one interval `min_alpha`
-    opaque. Cells that no training view sees, and those through which a photograph's alpha shows nothing, are
-    empty from the start.
+    Every `update_every` steps the field is evaluated at random points, one per cell; a cell keeps the larger of its
+    decayed value and the new one, and is occupied above the smaller of half the mean and the density that makes one
+    interval `min_alpha` opaque. Cells that no training view sees, and those that a photograph's alpha shows to be
+    empty, are empty from the start.
 
     Args:
         resolution: cells along a side of the box; a multiple of 4.
@@ -81,13 +81,13 @@ class OccupancySampler(RaggedSampler):
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
         self.grid = OccupancyGrid(resolution)
-        # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
+        # Computed on the host from the buffers when first needed: reading them stalls other devices.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
         self._least_density = 0.0
 
     def fit_to(self, scene: Scene) -> None:
-        """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
+        """Set the scene's box, near and far, and mark the cells that must be empty.
 
         Raises:
             InputError: the scene has no box, no training ray meets it, or nothing is left in it.
@@ -101,7 +101,7 @@ class OccupancySampler(RaggedSampler):
         self.grid.aabb.copy_(scene.aabb)
         self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
-        # In normalized device coordinates cells are not where the cameras see them, but all of them are seen.
+        # In normalized device coordinates the cameras do not see cells where they are, but all of them are seen.
         if scene.space == "ndc":
             self.grid.possible.fill_(True)
         else:
@@ -132,31 +132,31 @@ class OccupancySampler(RaggedSampler):
 
     @property
     def samples_at_first(self) -> int:
-        """As if every interval across the box held something."""
+        """The number of samples if every interval across the box held something."""
         return self.num_steps
 
     def forward(self, rays: RayBundle, random: RayRandom | None) -> RaggedSamples:
-        """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
-        rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
+        """Return the occupied intervals of each ray; without `random`, on the deterministic lattice of evaluation."""
+        rays = rays.map(torch.Tensor.detach)  # for learned cameras: which cells a ray meets has no gradient
         capacity = self.capacity_for(rays)
         if capacity is not None and self.opaque_below > 0:
             capacity = min(self.found_per_visible * capacity, self._most_intervals(rays))
         return march(rays, *self.grid_march(rays, random), capacity=capacity)[0]
 
     def grid_march(self, rays: RayBundle, random: RayRandom | None) -> GridMarch:
-        """Return where each ray stands, and through what it goes."""
+        """Return each ray's state, and the grid it goes through."""
         return GridMarch(self.start(rays, random), self.lattice, self.grid.occupied())
 
     def marcher(self, rays: RayBundle) -> RayMarcher:
-        """Begin to render rays: each march goes on where it stopped."""
+        """Start rendering rays: each march continues where it stopped."""
         return GridMarcher(self, rays)
 
     def statistics(self) -> dict[str, float]:
-        """Return the share of cells that are occupied."""
+        """Return the share of occupied cells."""
         return {"train/occupied": float(self.grid.cells.cpu().float().mean())}
 
     def capacity_for(self, rays: RayBundle) -> int | None:
-        """Return the size of the arrays of visible samples; None where sizes may be read on the host."""
+        """Return the size of the arrays of visible samples; None if sizes may be read on the host."""
         if rays.near.device.type != "cuda":
             return None
         expected = CAPACITY if self.sample_budget is None else 2 * self.sample_budget
@@ -166,13 +166,13 @@ class OccupancySampler(RaggedSampler):
         return rays.near.shape[0] * (self.lattice.numel() - 2)
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> MarchState:
-        """Return the beginning of a march along rays."""
+        """Return the initial state of a march along rays."""
         enter, leave = distances_in_box(rays, self.grid.aabb)
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
         return MarchState(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 
     def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
+        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays skip the rest."""
         kept = in_occupied(positions, self.grid.occupied()).nonzero()[:, 0]
         reached = torch.zeros_like(positions[:, 0])
         if kept.numel():
@@ -181,12 +181,12 @@ class OccupancySampler(RaggedSampler):
 
     @property
     def step_size(self) -> float:
-        """An interval, in scene units."""
+        """Length of an interval in scene units."""
         return float((self.grid.aabb[1] - self.grid.aabb[0]).norm()) / self.num_steps
 
     @property
     def lattice(self) -> Float[Tensor, "edges"]:
-        """The distances that intervals begin at, from the scene's near to beyond its far."""
+        """The distances at which intervals begin, from the scene's near to beyond its far."""
         if self._lattice is None:
             near, far = self.grid.range.tolist()
             edges, step = [near], self.step_size
@@ -199,10 +199,10 @@ class OccupancySampler(RaggedSampler):
         return self._lattice
 
     def lattice_over(self, rays: RayBundle) -> Float[Tensor, "edges"]:
-        """Return the lattice for rendering from anywhere: from afar, or from close by.
+        """Return the lattice for rendering from anywhere, near or far.
 
-        It is `lattice` where that reaches; elsewhere it is shifted by whole intervals. On devices that compile for
-        fixed shapes (XLA) it is always `lattice`.
+        It is `lattice` if that covers the rays, else shifted by whole intervals. On devices that compile for fixed
+        shapes (XLA) it is always `lattice`.
         """
         if rays.near.device.type not in HOSTS or not rays.near.numel():
             return self.lattice
@@ -217,7 +217,7 @@ class OccupancySampler(RaggedSampler):
         return (near + step * number).float().to(rays.near.device)
 
     def _require_few(self, intervals: float) -> None:
-        """Refuse a march that would not end: near, far and the box may come out of a file."""
+        """Refuse an endless march: near, far and the box may come from a file."""
         if not intervals <= self.max_intervals:
             raise InputError(
                 f"A ray from near to far would be cut into {intervals:.3g} intervals of {self.step_size:.3g} scene "
@@ -227,12 +227,12 @@ class OccupancySampler(RaggedSampler):
 
     @torch.no_grad()
     def learn(self, density: DensityFn, step: int, key: int) -> None:
-        """Ask the field about the cells, where it is time; without reading anything on the host.
+        """Update the cells from the field when it is time, without reading anything on the host.
 
         Args:
-            density: the field's.
-            step: steps that this attempt has taken.
-            key: of this step's random numbers.
+            density: the field's density.
+            step: steps taken in this attempt.
+            key: key of this step's random numbers.
         """
         if step % self.update_every or step == 0:
             return
@@ -253,18 +253,18 @@ class OccupancySampler(RaggedSampler):
 
 
 class GridMarcher(RayMarcher):
-    """Marches of rays through a grid, each with its place."""
+    """Marches of rays through a grid, each with its position."""
 
     def __init__(self, sampler: OccupancySampler, rays: RayBundle):
         self.rays, self.state = rays, sampler.start(rays, None)
         self.lattice, self.cells = sampler.lattice_over(rays), sampler.grid.occupied()
 
     def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[RaggedSamples, Bool[Tensor, "alive"]]:
-        """March on from where each ray stands."""
+        """Continue each ray's march from its position."""
         samples, following = march(self.rays[alive], self.state[alive], self.lattice, self.cells, limit)
         self.state.next[alive] = following
         return samples, following < self.lattice.numel() - 2
 
     def grid_march(self) -> GridMarch:
-        """Return where each ray stands, and through what it goes."""
+        """Return each ray's state, and the grid it goes through."""
         return GridMarch(self.state, self.lattice, self.cells)

@@ -1,4 +1,4 @@
-"""The grid of an occupancy sampler: where its cells lie, and what is known of each."""
+"""The grid of an occupancy sampler: where its cells are, and what is known of each."""
 
 from typing import Any
 
@@ -24,15 +24,15 @@ class OccupancyGrid(Part):
     range: Tensor
     """Near and far of the scene."""
     density: Tensor
-    """A decaying maximum of what was found in each cell."""
+    """A decaying maximum of the density found in each cell."""
     possible: Tensor
     """Which cells may ever hold something."""
     cells: Tensor
     """1 where occupied."""
     blocks: Tensor
-    """1 where any cell of a block is."""
+    """1 where any cell of a block is occupied."""
     leaps: Tensor
-    """How far the next such block is. A recorded step reads it where it lay: it is written to, never replaced."""
+    """Distance to the next such block. A recorded step reads it at a fixed address: write to it, never replace it."""
 
     def __init__(self, resolution: int) -> None:
         super().__init__()
@@ -48,10 +48,10 @@ class OccupancyGrid(Part):
         self.register_buffer("leaps", torch.zeros(blocks, dtype=torch.uint8), persistent=False)
 
     def validate_state(self) -> None:
-        """Look at what was loaded.
+        """Check the loaded state.
 
         Raises:
-            InputError: a box without inside, or cells that are neither empty nor occupied.
+            InputError: an empty box, or cells that are neither empty nor occupied.
         """
         require_box(self.aabb)
         near, far = self.range.tolist()
@@ -60,22 +60,22 @@ class OccupancyGrid(Part):
             raise InputError(f"The occupancy grid in the model's state cannot be one. {ANOTHER}")
 
     def occupied(self) -> OccupancyCells:
-        """Return what a march looks at: which cells are occupied now."""
+        """Return the currently occupied cells, for a march."""
         return OccupancyCells(self.aabb, self.cells, self.leaps)
 
     def reset_parameters(self) -> None:
-        """Forget what was learned: every possible cell is occupied."""
+        """Reset the grid: every possible cell is occupied."""
         self.density.zero_()
         self.occupy(self.possible)
 
     def update(self, density: DensityFn, number: Int[Tensor, "cells"], key: int, decay: float) -> None:
-        """Ask the field at a random point of each of some cells: a cell keeps the larger of its decayed value and that.
+        """Evaluate the field at a random point in some cells; each keeps the larger of its decayed and its new value.
 
         Args:
-            density: the field's.
-            number: of the cells.
-            key: of this step's random numbers.
-            decay: of what a cell held.
+            density: the field's density.
+            number: indices of the cells.
+            key: key of this step's random numbers.
+            decay: factor on a cell's previous value.
         """
         kept = self.density.view(-1)
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
@@ -83,12 +83,12 @@ class OccupancyGrid(Part):
             kept[cells] = torch.maximum(decay * kept[cells], density(self.positions(cells, part)).float())
 
     def prune(self, least_density: float) -> None:
-        """Leave occupied what is denser than half the mean of the possible cells, or than `least_density`."""
+        """Keep occupied the cells that are denser than half the mean of the possible cells, or than `least_density`."""
         mean = self.density.sum() / self.possible.sum()
         self.occupy((self.density > (0.5 * mean).clamp(max=least_density)) & self.possible)
 
     def occupy(self, occupied: Tensor) -> None:
-        """Say which cells rays may not pass over."""
+        """Set the cells that rays may not skip."""
         self.cells.copy_(occupied)
         self.blocks.copy_(blocks_of(self.cells))
         self.leaps.copy_(leaps_over(self.blocks))
@@ -98,7 +98,7 @@ class OccupancyGrid(Part):
         self.leaps.copy_(leaps_over(self.blocks))
 
     def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
-        """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""
+        """Return points in cells; `within` is the position in each, from 0 to 1 along its sides."""
         side = self.resolution
         cell = torch.stack([number // side**2, number // side % side, number % side], dim=-1)
         return self._from_cells(cell + within)
@@ -111,6 +111,6 @@ class OccupancyGrid(Part):
         return torch.stack(torch.meshgrid(*axes, indexing="ij")).view(3, -1).t(), half_diagonal
 
     def _from_cells(self, at: Tensor) -> Tensor:
-        """Return places that are given in cells from the lower corner of the box."""
+        """Return positions that are given in cells from the lower corner of the box."""
         center, half = center_and_half(self.aabb)
         return center + (2.0 * at / self.resolution - 1.0) * half

@@ -1,4 +1,4 @@
-"""Samples drawn anew from what a cheaper level saw: the proposals of mip-NeRF 360 (Sec. 3, arXiv 2111.12077)."""
+"""Samples drawn from what a cheaper level saw: the proposals of mip-NeRF 360 (Sec. 3, arXiv 2111.12077)."""
 
 import torch
 
@@ -10,9 +10,9 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
 class ProposalSampler(DenseSampler):
-    """Draw the fenceposts of this level from the histogram of the level before, and keep none of that level's own.
+    """Draw the fenceposts of this level from the histogram of the previous level, and keep none of that level's own.
 
-    The positions carry no gradient: the level before learns from the interlevel loss alone.
+    Positions carry no gradients: the previous level learns only from the interlevel loss.
 
     Args:
         num_samples: intervals of this level.
@@ -37,10 +37,10 @@ class ProposalSampler(DenseSampler):
         return RaySamples(edges=found, contracted_spacing=contracted)
 
     def num_samples_after(self, before: int) -> int:
-        """Always `num_samples`.
+        """Return `num_samples`.
 
         Raises:
-            ValueError: there is no level before.
+            ValueError: there is no previous level.
         """
         if before < 1:
             raise ValueError("a proposal sampler needs a level before it, to draw from")

@@ -1,4 +1,4 @@
-"""What the photographs' frames and alpha say of space before anything is learned: seen at all, and not seen through."""
+"""What the photographs' frames and alpha say about space before training: cells that are seen, but not through."""
 
 import math
 
@@ -12,31 +12,31 @@ from nerf_lightning.nerf.kernels.carving.op import steps_for
 from nerf_lightning.nerf.types.scene import Scene
 
 WRONG_BY = math.radians(1.0)
-"""Cameras that are learned may be turned by so much."""
+"""Angle by which learned cameras may be wrong initially."""
 AGREEING = 3
-"""So many of them must see through a cell."""
+"""Number of learned cameras that must see through a cell."""
 
 
 def possible_cells(
     scene: Scene, centers: Float[Tensor, "cells 3"], half_diagonal: float, most_views: int = 48
 ) -> Bool[Tensor, "cells"]:
-    """Tell the cells that training views see and through which none of them looks at nothing.
+    """Return the cells that training views see, and that none of them sees through.
 
-    A cell is left out where no view sees it, and where some view sees it whole and shows only pixels of alpha 0 there:
-    a ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha
-    nothing is carved.
+    A cell is left out if no view sees it, or if some view sees it entirely and shows only pixels of alpha 0 there: a
+    ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha nothing
+    is carved.
 
-    Carving is permanent, and cameras that are learned may start at a wrong pose. They carve less: not within 1 degree
-    of what their photographs show, and only what three of them agree on.
+    Carving is permanent, and learned cameras may start at a wrong pose. They carve less: not within 1 degree of what
+    their photographs show, and only what three of them agree on.
 
     Args:
         scene: cameras and pixels.
         centers: the cells' centers in scene units.
         half_diagonal: from a cell's center to its corner.
-        most_views: carving looks at so many views, evenly spread.
+        most_views: maximum number of views used for carving, evenly spaced.
     """
     views, steps = scene.splits["train"], steps_for(scene.cameras, centers)
-    centers = centers.t().contiguous().t()  # an axis after the other in memory, as kernels like to read them
+    centers = centers.t().contiguous().t()  # axis by axis in memory, as kernels read them fastest
     cells = torch.zeros(centers.shape[0], dtype=torch.bool)
     for view in views:
         if bool(cells.all()):
@@ -56,12 +56,12 @@ def possible_cells(
 def _matter(scene: Scene, view: int) -> Bool[Tensor, "height width"]:
     matter = scene.pixels.view(view)[..., 3] > 0
     kept = scene.pixels.kept(view)
-    matter = matter if kept is None else matter | ~kept  # what is masked may be anything
+    matter = matter if kept is None else matter | ~kept  # masked pixels may be anything
     return _grown(matter, round(WRONG_BY * float(scene.cameras.focal[view].mean()))) if scene.refined else matter
 
 
 def _grown(matter: Bool[Tensor, "height width"], pixels: int) -> Bool[Tensor, "height width"]:
-    """Return where matter is at most so many pixels away, along both axes."""
+    """Return where matter is at most `pixels` pixels away along both axes."""
     grown, side = matter[None].float(), 2 * pixels + 1
     for kernel, padding in (((side, 1), (pixels, 0)), ((1, side), (0, pixels))):
         grown = max_pool2d(grown, kernel, stride=1, padding=padding)

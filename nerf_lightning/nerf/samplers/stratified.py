@@ -14,11 +14,11 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class StratifiedSampler(DenseSampler):
-    """Cut each ray into equal intervals, and jitter every inner fencepost of every ray within half an interval.
+    """Cut each ray into equal intervals, and jitter every inner fencepost by up to half an interval.
 
-    Each fencepost is uniform in a stratum of its own, so the midpoints at which the field is asked cover the whole
-    ray over the steps. Without random numbers the intervals are equal. In contracted scenes they are equal in the
-    spacing of `geometry.spacing`, elsewhere in distance.
+    Each fencepost is uniform in its own stratum, so the midpoints at which the field is evaluated cover the whole ray
+    over the steps. Without random numbers the intervals are equal. In contracted scenes they are equal in normalized
+    distance (`geometry.contraction`), elsewhere in distance.
 
     Args:
         num_samples: intervals per ray.
@@ -32,7 +32,7 @@ class StratifiedSampler(DenseSampler):
         self.contracted = Contracted()
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the scene's space."""
+        """Record the scene's space."""
         self.contracted.fit_to(scene)
 
     def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
@@ -46,7 +46,7 @@ class StratifiedSampler(DenseSampler):
         return RaySamples(stratified_edges(shares, jitter, low, high, contracted), contracted)
 
     def num_samples_after(self, before: int) -> int:
-        """Always `num_samples`."""
+        """Return `num_samples`."""
         return self.num_samples
 
 
@@ -58,13 +58,13 @@ def stratified_edges(
     high: Float[Tensor, "*rays"],
     contracted: bool,
 ) -> Float[Tensor, "*rays edges"]:
-    """Return the fenceposts low + shares (high - low); contracted: the distances of which these are normalized ones.
+    """Return the fenceposts low + shares (high - low); contracted: the distances whose normalized distances these are.
 
     Args:
         shares: from 0 to 1.
         jitter: added to each ray's inner shares; None: nothing.
-        low: where each ray begins.
-        high: where each ray ends.
+        low: start of each ray.
+        high: end of each ray.
         contracted: whether `low` and `high` are normalized distances.
     """
     s = shares.expand(*low.shape, -1)

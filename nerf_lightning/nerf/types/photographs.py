@@ -1,4 +1,4 @@
-"""What a model may see that renders a scene from its photographs."""
+"""The data of a model that renders a scene from its photographs."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ class Photographs(TensorStruct):
     """Photographs of one or several captures, with where they were taken; `.to(device)` leaves the pixels in place."""
 
     cameras: Cameras
-    """One per photograph, through the world (`Cameras.ndc` is None)."""
+    """One per photograph, in world coordinates (`Cameras.ndc` is None)."""
     pixels: PixelStore
-    """Theirs alone, in the same order; the flat array may hold others."""
+    """Pixels of these photographs, in the same order; the flat array may hold others."""
     numbers: Int[Tensor, "views"]
-    """What number each has in the scene: what `RayBundle.photograph` says."""
+    """Each photograph's number in the scene, as in `RayBundle.photograph`."""
     capture: Int[Tensor, "views"]
-    """Number of the capture that each belongs to: what `RayBundle.capture` says."""
+    """The number of each photograph's capture, as in `RayBundle.capture`."""
     background: Background
-    """What lies behind transparent pixels."""
+    """What is behind transparent pixels."""
     middle: Float[Tensor, "captures 3"]
     """What the cameras of each capture look at, scene units."""
     around: Bool[Tensor, "captures"]
-    """Whether a capture's cameras stand around its content; else they face forward, or look everywhere."""
+    """Whether a capture's cameras surround its content; else they face forward, or look everywhere."""

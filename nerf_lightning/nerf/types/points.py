@@ -1,4 +1,4 @@
-"""What a field is asked about."""
+"""The input of a field."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,19 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 @dataclass(frozen=True)
 class Points(TensorStruct):
-    """Points in space, from where they are seen, and for whom.
+    """Points in space, with the directions and photographs from which they are seen.
 
-    What all samples of a ray share (its direction, its photograph) stands there once, with an axis of length 1.
+    What all samples of a ray share (its direction, its photograph) is stored once, with an axis of length 1.
     """
 
     positions: Float[Tensor, "*points 3"]
-    """Scene units."""
+    """Positions in scene units."""
     directions: Float[Tensor, "*#points 3"] | None = None
-    """Unit length, from the camera to the point; None where density alone is asked for."""
+    """Unit length, from the camera to the point; None if only density is needed."""
     photograph: Int[Tensor, "*#points"] | None = None
-    """Number of the view whose photograph is explained; None outside of training steps (`RayBundle.photograph`)."""
+    """Number of the view whose photograph is explained; None outside training steps (`RayBundle.photograph`)."""
     random: PointRandom | None = None
-    """The step's random numbers; None outside of training steps."""
+    """The step's random numbers; None outside training steps."""
     covariance: Float[Tensor, "*points 6"] | None = None
-    """Of what a sample stands for of its pixel's cone (`geometry.cones`), scene units squared; None where nobody asks
-    (`Field.sees_cones`), and where a point is no pixel's."""
+    """Covariance of the part of its pixel's cone that a sample represents (`geometry.cones`), scene units squared; None
+    if unused (`Field.sees_cones`), or if a point belongs to no pixel."""

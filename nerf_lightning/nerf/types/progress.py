@@ -1,19 +1,20 @@
-"""How far a run is: all that its random numbers depend on, beside the seed."""
+"""The progress of a run: all that its random numbers depend on, besides the seed."""
 
 from dataclasses import dataclass, fields
 
 SIZES_PER_HALVING, HALVINGS = 4, 7
-"""Of batches. Each size has a CUDA graph of its own, and what is wanted is rounded down by 8 % on average."""
+"""Batch sizes per halving, and halvings. Each size has its own CUDA graph, and the wanted size is rounded down by 8 %
+on average."""
 WHOLE_BLOCKS = 256
-"""Larger batches are multiples of this: Triton compiles kernels anew for sizes that 16 does not divide."""
+"""Larger batches are multiples of this: Triton recompiles kernels for sizes that are not multiples of 16."""
 
 
 def batch_sizes(largest: int, together: int = 1) -> list[int]:
-    """Return the sizes that batches may have, the largest first: about 0.84 times the one before each.
+    """Return the possible batch sizes, the largest first: each about 0.84 times the one before.
 
     Args:
-        largest: the largest, a multiple of `together`.
-        together: all are multiples of it.
+        largest: the largest size, a multiple of `together`.
+        together: all sizes are multiples of it.
 
     >>> batch_sizes(4096)[:9], batch_sizes(4096)[-1]
     ([4096, 3328, 2816, 2304, 2048, 1536, 1280, 1024, 768], 32)
@@ -27,7 +28,7 @@ def batch_sizes(largest: int, together: int = 1) -> list[int]:
 
 
 def batch_size(largest: int, wanted: float, together: int = 1) -> int:
-    """Return the largest of `batch_sizes` that is at most `wanted`; the smallest where all are larger.
+    """Return the largest of `batch_sizes` that is at most `wanted`; the smallest if all are larger.
 
     >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, together=256)
     (1280, 4096, 32, 256)
@@ -38,24 +39,24 @@ def batch_size(largest: int, wanted: float, together: int = 1) -> int:
 
 @dataclass
 class Progress:
-    """How far a run is: all that its randomness and its order of rays depend on, besides the config."""
+    """The progress of a run: all that its randomness and its order of rays depend on, besides the config."""
 
     attempt: int = 0
     """Raised by the collapse guard at each restart."""
     step: int = 0
     """Steps taken in this attempt."""
     rays_seen: int = 0
-    """Rays trained on in this attempt, those of the center crop included."""
+    """Rays trained on in this attempt, including those of the center crop."""
     batch_rays: int = 0
-    """Rays of the next step; they may adapt to how many samples a ray has."""
+    """Rays of the next step, which may adapt to the number of samples per ray."""
     largest_batch: int = 0
-    """Rays of a step at most."""
+    """Maximum number of rays per step."""
     rollbacks: int = 0
-    """Attempts that went back to a checkpoint, instead of the beginning."""
+    """Attempts that went back to a checkpoint instead of the beginning."""
 
     @property
     def restarts(self) -> int:
-        """Attempts that began anew."""
+        """Attempts that began from scratch."""
         return self.attempt - self.rollbacks
 
     def advance(self, num_rays: int) -> None:
@@ -64,7 +65,7 @@ class Progress:
         self.rays_seen += num_rays
 
     def take_up(self, other: "Progress") -> None:
-        """Go on from the place of another run."""
+        """Continue from the progress of another run."""
         for place in fields(self):
             setattr(self, place.name, getattr(other, place.name))
 

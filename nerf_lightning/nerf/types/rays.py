@@ -20,22 +20,24 @@ class RayBundle(TensorStruct):
     near: Float[Tensor, "*rays"]
     far: Float[Tensor, "*rays"]
     view_directions: Float[Tensor, "*rays 3"]
-    """Where the camera looks in the world, unit length: what color depends on. Differs from `directions` in
-    normalized device coordinates."""
+    """Directions in the world, unit length, on which color depends. They differ from `directions` in normalized device
+    coordinates."""
     photograph: Int[Tensor, "*rays"] | None = None
     """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
-    films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen. Models
-    that look at photographs are told of it wherever a view is rendered, since they must not look at the view itself."""
+    films, exports, the viewer), where what is specific to a photograph, such as its exposure, must not be visible. For
+    models that render from photographs it is set whenever a view is rendered, since they must not use the view
+    itself."""
     capture: Int[Tensor, "*rays"] | None = None
-    """Number of the capture that each ray runs through; None: the first, which is mostly the only one."""
+    """Number of each ray's capture; None: the first, which is usually the only one."""
     pixel_side: Float[Tensor, "*rays 2"] | None = None
-    """Side of the ray's pixel (root of its area) at distance 0, and by how much it grows per unit of distance; None for
-    rays that are no pixel's."""
+    """Side of the ray's pixel (root of its area) at distance 0, and its growth per unit of distance; None for rays that
+    belong to no pixel."""
     together: int = 1
-    """So many rays after one another belong to pixels of a picture that touch, and may share where they are sampled."""
+    """Number of consecutive rays that belong to adjacent pixels of a picture, and may share their samples'
+    positions."""
 
     def between(self) -> "RayBundle":
-        """Return the ray in the middle of those that come together, and of what has no middle that of the first."""
+        """Return the mean ray of each group of `together` rays, with the first ray's values where there is no mean."""
         count = self.together
 
         def middle(column: Tensor) -> Tensor:
@@ -53,21 +55,22 @@ class RaySamples(TensorStruct):
     edges: Float[Tensor, "*rays edges"]
     """Increasing distances; one more than there are samples."""
     contracted_spacing: bool = False
-    """Whether even steps are those of `geometry.spacing`, for space without bounds, and not of the distance."""
+    """Whether steps are even in normalized distance (`geometry.contraction`), for unbounded space, instead of
+    distance."""
 
     @property
     def starts(self) -> Float[Tensor, "*rays samples"]:
-        """Where each interval begins."""
+        """Start of each interval."""
         return self.edges[..., :-1]
 
     @property
     def ends(self) -> Float[Tensor, "*rays samples"]:
-        """Where each interval ends."""
+        """End of each interval."""
         return self.edges[..., 1:]
 
     @property
     def midpoints(self) -> Float[Tensor, "*rays samples"]:
-        """Where the field is asked."""
+        """Where the field is evaluated."""
         return 0.5 * (self.starts + self.ends)
 
     @property
@@ -78,10 +81,10 @@ class RaySamples(TensorStruct):
 
 @dataclass(frozen=True)
 class RaggedSamples(TensorStruct):
-    """Only the intervals that may hold something, ray after ray, each ray's in order.
+    """Only the intervals that may hold something, ray by ray, in order along each ray.
 
-    The arrays have a capacity; what lies beyond the last bound is padding of zero length, spread over the rays, since a
-    GPU adds up what flows back to one ray one by one. It is ragged for speed, and has functions of its own
+    The arrays have a capacity; beyond the last bound is padding of zero length, spread over the rays, since a GPU
+    accumulates the gradients of one ray serially. The layout is ragged for speed, and has its own functions
     (`rendering.ragged`).
     """
 
@@ -91,24 +94,24 @@ class RaggedSamples(TensorStruct):
     bounds: Int[Tensor, "bounds"]
     """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
     found: Int[Tensor, ""]
-    """How many there were before what exceeds the capacity was dropped."""
+    """Number of samples before those that exceed the capacity were dropped."""
     longest: int | None = None
-    """No ray has more samples; None: the bounds say so, read on the host."""
+    """Maximum number of samples of any ray; None: given by the bounds, read on the host."""
 
     @property
     def sample_index(self) -> Int[Tensor, "capacity"]:
-        """Number of each sample in its ray, from 0."""
+        """Index of each sample on its ray, from 0."""
         first = self.bounds.index_select(0, self.ray_index)
         return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - first
 
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "RaggedSamples":
-        """Return some of the samples, in order, with the bounds that they have then."""
+        """Return some of the samples, in order, with their new bounds."""
         ray, starts, ends = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
         return RaggedSamples(ray, starts, ends, bounds, self.found, self.longest)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:
-        """Where the field is asked."""
+        """Where the field is evaluated."""
         return 0.5 * (self.starts + self.ends)
 
     @property
@@ -138,7 +141,7 @@ class KnownDepths(TensorStruct):
     certainty: Float[Tensor, "known"]
     """In (0, 1]: 1 / (1 + (relative error / `CERTAIN`)^2)."""
     from_pictures: bool = False
-    """Whether they follow from the photographs, and are none of the capture's own."""
+    """Whether they were computed from the photographs instead of given by the capture."""
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -152,15 +155,15 @@ class Batch(TensorStruct):
     rgba: Float[Tensor, "*rays 4"]
     """Straight alpha; blended with the step's background in one place (`rendering.background`)."""
     weight: Float[Tensor, "*rays"]
-    """How much each pixel counts: 0 where it is masked, else 1."""
+    """Weight of each pixel: 0 if masked, else 1."""
     distance: Float[Tensor, "*rays"] | None = None
-    """Of the surface along the unit ray, scene units, where `certainty` is not 0; None: unknown everywhere."""
+    """Distance of the surface along the unit ray, scene units, where `certainty` is not 0; None: unknown everywhere."""
     certainty: Float[Tensor, "*rays"] | None = None
-    """How much each distance counts, in [0, 1]; 0 where it is unknown."""
+    """Weight of each distance, in [0, 1]; 0 where it is unknown."""
 
     @property
     def num_rays(self) -> int:
-        """How many pixels there are, each with its ray."""
+        """Number of pixels, each with its ray."""
         return self.weight.numel()
 
 
@@ -171,12 +174,13 @@ class Target(TensorStruct):
     rgb: Float[Tensor, "*rays 3"]
     """What the photographs show, over the step's background."""
     weight: Float[Tensor, "*rays"]
-    """Of each ray, >= 0; its mean over the whole batch is 1."""
+    """Weight of each ray, >= 0; its mean over the whole batch is 1."""
     pixels: PixelIndex
-    """Where in which photograph each ray lies."""
+    """The photograph and pixel of each ray."""
     distance: Float[Tensor, "*rays"] | None = None
-    """Where along each ray the surface is, in the units of its samples, if `certainty` is not 0; None: unknown."""
+    """Distance of the surface along each ray, in the units of its samples, where `certainty` is not 0; None:
+    unknown."""
     certainty: Float[Tensor, "*rays"] | None = None
-    """How much each distance counts, in [0, 1]; 0 where it is unknown."""
+    """Weight of each distance, in [0, 1]; 0 where it is unknown."""
     infinity: Float[Tensor, "*rays"] | None = None
-    """Where along each ray the world ends, in normalized device coordinates; None: nowhere."""
+    """Distance along each ray at which the world ends, in normalized device coordinates; None: nowhere."""

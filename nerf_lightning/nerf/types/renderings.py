@@ -1,4 +1,4 @@
-"""What a field says of points, and what a level makes of it along each ray."""
+"""The output of a field at points, and of a level along rays."""
 
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -15,19 +15,19 @@ Kind = TypeVar("Kind", bound="Rendering")
 
 @dataclass(frozen=True)
 class FieldOutput(TensorStruct):
-    """What a field says of points in space."""
+    """The output of a field at points in space."""
 
     density: Float[Tensor, "*points"]
     """Per unit length, >= 0."""
     rgb: Float[Tensor, "*points 3"]
     """In [0, 1]."""
     channels: dict[str, Float[Tensor, "*points _"]] = field(default_factory=dict, kw_only=True)
-    """Whatever else a field says (features, classes, normals), by name; composited and rendered like color."""
+    """Other outputs of a field (features, classes, normals), by name; composited and rendered like color."""
 
 
 @dataclass(frozen=True)
 class Rendering(TensorStruct):
-    """What one level saw along each ray."""
+    """What one level rendered along each ray."""
 
     rgb: Float[Tensor, "*rays 3"]
     """Composited over the background, exactly once."""
@@ -38,7 +38,7 @@ class Rendering(TensorStruct):
     depth: Float[Tensor, "*rays"]
     """Expected distance along the ray; light that escapes ends at far."""
     penalty: Float[Tensor, "*rays"] | None = field(default=None, kw_only=True)
-    """What a level in training adds to the loss of each ray, whatever the loss; None: nothing."""
+    """What a level adds to the loss of each ray in training, for any loss; None: nothing."""
     channels: dict[str, Float[Tensor, "*rays _"]] = field(default_factory=dict, kw_only=True)
     """The field's channels, composited like color over nothing: sums of weights times values."""
 
@@ -52,7 +52,7 @@ class Rendering(TensorStruct):
         depth: Float[Tensor, "*rays"],
         **of_the_kind: Any,
     ) -> Kind:
-        """Return what is seen, given per ray sum of w rgb, sum of w and sum of w t, and the fields of its class.
+        """Return the rendering, given per ray sum of w rgb, sum of w and sum of w t, and the fields of the subclass.
 
         Light that escapes belongs to the background and, in the depth, to far.
         """
@@ -75,7 +75,7 @@ class Rendering(TensorStruct):
         depth: Float[Tensor, "*rays"],
         channels: dict[str, Tensor] | None = None,
     ) -> "Rendering":
-        """Return what is seen, given the light that escapes (transmittance at the end) and the sum of w t."""
+        """Return the rendering, given the light that escapes (transmittance at the end) and the sum of w t."""
         return cls(
             rgb=foreground if background is None else foreground + light[..., None] * background,
             foreground=foreground,
@@ -87,7 +87,7 @@ class Rendering(TensorStruct):
 
 @dataclass(frozen=True)
 class DenseRendering(Rendering):
-    """A level whose rays all have the same number of samples."""
+    """The rendering of a level whose rays all have the same number of samples."""
 
     weights: Float[Tensor, "*rays samples"]
     samples: RaySamples
@@ -95,7 +95,7 @@ class DenseRendering(Rendering):
 
 @dataclass(frozen=True)
 class RaggedRendering(Rendering):
-    """A level that skipped what is empty."""
+    """The rendering of a level that skips empty space."""
 
     weights: Float[Tensor, "capacity"]
     samples: RaggedSamples

@@ -1,4 +1,4 @@
-"""What a reader returns: cameras, pixels, and where the content lies."""
+"""What a reader returns: cameras, pixels, and where the content is."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,30 +14,30 @@ from nerf_lightning.nerf.types.rays import KnownDepths
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
-"""What lies behind the scene.
+"""What is behind the scene.
 
 `random`: a new color for each ray of a step, which teaches empty space to be empty; at evaluation white.
 `white_or_random`: the same, but white behind pixels that may show some of a background that was cut out (`UNSURE`).
-`black_or_random`: the same with black, which it is at evaluation, too. `none`: nothing. The last interval of a dense
-level takes all the light that is left; levels behind an occupancy grid have no such interval, and leave it black.
+`black_or_random`: the same with black, also at evaluation. `none`: nothing. The last interval of a dense level absorbs
+all remaining light; levels with an occupancy grid have no such interval, and leave it black.
 """
 
 DRAWN: tuple[Background, ...] = ("random", "white_or_random", "black_or_random")
 
 UNSURE = 254
-"""Alpha, of 255, of pixels that may show a background which was cut out: outlines, and holes."""
+"""Alpha (of 255) of pixels that may show a background that was cut out: outlines and holes."""
 
 LensModel = Literal["pinhole", "radial_tangential", "fisheye", "equirectangular"]
-"""How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`, those of equirectangular
-panoramas, which show all directions, in `geometry.panoramas`."""
+"""How a lens distorts a pinhole's image; the formulas are in `geometry.lenses`, those of equirectangular panoramas,
+which show all directions, in `geometry.panoramas`."""
 
 Space = Literal["bounded", "ndc", "contracted"]
-"""How much of the world is modeled: a box, all that lies in front of a near plane (normalized device coordinates), or
+"""The modeled part of the world: a box, everything in front of a near plane (normalized device coordinates), or
 everything, contracted around a box."""
 
 
 OPENCV_ORDER, OPENCV_FISHEYE = [0, 1, 4, 5, 2], [0, 1, 2, 3]
-"""Where OpenCV's coefficients stand among `Cameras.lens`."""
+"""Positions of OpenCV's coefficients in `Cameras.lens`."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Cameras(TensorStruct):
     center: Float[Tensor, "*views 2"]
     """Principal point in pixels from the upper left corner of the image (x, y)."""
     lens: Float[Tensor, "*views 6"]
-    """Distortion coefficients k1, k2, k3, k4, p1, p2 in the sense of OpenCV; zeros for a pinhole, p 0 for a fisheye."""
+    """Distortion coefficients k1, k2, k3, k4, p1, p2 as in OpenCV; zeros for a pinhole, p 0 for a fisheye."""
     lens_model: LensModel
-    """What the coefficients mean; one for all views of a scene."""
+    """The meaning of the coefficients; one for all views of a scene."""
     width: Int[Tensor, "*views"]
     """Image width in pixels."""
     height: Int[Tensor, "*views"]
     """Image height in pixels."""
     ndc: Float[Tensor, "*views 2"] | None = None
-    """Focal length over half the image's size, where rays run through normalized device coordinates (`geometry.ndc`)
-    and the world's z axis is the captures' back; None: rays run through the world."""
+    """Focal length over half the image's size, if rays are in normalized device coordinates (`geometry.ndc`) and the
+    world's z axis points back from the scene; None: rays are in world coordinates."""
 
     @classmethod
     def from_opencv(
@@ -75,16 +75,16 @@ class Cameras(TensorStruct):
         """Return cameras whose axes are right, down, forward, as in OpenCV, COLMAP and nerfstudio's files.
 
         Args:
-            c2w: camera to world; `torch.linalg.inv` of OpenCV's extrinsics. A fourth row is left out.
+            c2w: camera to world; `torch.linalg.inv` of OpenCV's extrinsics. A fourth row is ignored.
             matrix: the camera matrix, in pixels.
             size: (width, height) in pixels.
             distortion: k1, k2, p1, p2 and perhaps k3 of `cv2.projectPoints`; of a fisheye up to four k of
                 `cv2.fisheye`; None: a pinhole.
-            fisheye: which of the two.
-            pixel_center: where the center of the first pixel lies: 0.5 as in COLMAP, 0 as `cv2.calibrateCamera` has it.
+            fisheye: whether `distortion` is of a fisheye.
+            pixel_center: coordinate of the first pixel's center: 0.5 as in COLMAP, 0 as in `cv2.calibrateCamera`.
 
         Raises:
-            InputError: a skewed camera matrix, or coefficients that no lens here has (a rational or prism model).
+            InputError: a skewed camera matrix, or unsupported coefficients (a rational or prism model).
         """
         views = c2w.shape[:-2]
         given = torch.zeros(*views, 0) if distortion is None else distortion.to(c2w.device).expand(*views, -1)
@@ -117,7 +117,7 @@ class Cameras(TensorStruct):
         """Return what `from_opencv` takes: camera to world, camera matrix, and k1 k2 p1 p2 k3 (a fisheye's four k).
 
         Raises:
-            InputError: a panorama, or a fourth radial coefficient, which OpenCV gives another meaning.
+            InputError: a panorama, or a fourth radial coefficient, which has another meaning in OpenCV.
         """
         fisheye = self.lens_model == "fisheye"
         if self.lens_model == "equirectangular" or (not fisheye and bool((self.lens[..., 3] != 0).any())):
@@ -134,32 +134,32 @@ class Cameras(TensorStruct):
 class PixelStore:
     """Every pixel of every view in one flat array; views may differ in size. Row by row, row 0 on top.
 
-    The arrays may be a file's, mapped into memory and larger than it: index them, never go over the whole.
+    The arrays may be memory-mapped from a file and larger than memory: index them, never traverse them.
     """
 
     rgba: UInt8[Tensor, "pixels 4"]
-    """Straight (not premultiplied) alpha; 255 where the format has none."""
+    """Straight (not premultiplied) alpha; 255 if the format has none."""
     offset: Int[Tensor, "views"]
     """Index of each view's first pixel."""
     width: Int[Tensor, "views"]
     height: Int[Tensor, "views"]
     has_transparency: bool
-    """Whether the alpha of any pixel says more than that something is there."""
+    """Whether any pixel is not fully opaque."""
     mask: UInt8[Tensor, "pixels"] | None = None
-    """1 where a pixel is trained on and scored, 0 where it is left out; None keeps all."""
+    """1 if a pixel is trained on and scored, 0 if it is left out; None keeps all."""
 
     def view(self, index: int) -> UInt8[Tensor, "height width 4"]:
         """Return one view as a picture (no copy)."""
         return self._picture(self.rgba, index)
 
     def kept(self, index: int) -> Bool[Tensor, "height width"] | None:
-        """Return which pixels of one view the mask keeps; None where there is no mask."""
+        """Return which pixels of one view the mask keeps; None without a mask."""
         return None if self.mask is None else self._picture(self.mask, index) > 0
 
     def index_of(
         self, view: Int[Tensor, "*pixels"], x: Int[Tensor, "*pixels"], y: Int[Tensor, "*pixels"]
     ) -> Int[Tensor, "*pixels"]:
-        """Return where pixels lie in the flat arrays."""
+        """Return the indices of pixels in the flat arrays."""
         return self.offset[view] + y * self.width[view] + x
 
     def _picture(self, flat: Tensor, index: int) -> Tensor:
@@ -168,7 +168,7 @@ class PixelStore:
 
 
 class Truth(NamedTuple):
-    """The exact geometry of each pixel of a view, where a scene knows it, row by row."""
+    """The exact geometry of each pixel of a view, if a scene knows it, row by row."""
 
     depth: Float[Tensor, "pixels"]
     """Distance along the unit ray through the pixel's center to the first surface; inf where there is none."""
@@ -178,7 +178,7 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What outlives the pictures: enough to render, and to place what is rendered in the user's frame."""
+    """The part of a scene that outlives its pictures: enough to render, and to place renders in the user's frame."""
 
     name: str
     cameras: Cameras
@@ -189,19 +189,19 @@ class SceneRecord:
     aabb: Float[Tensor, "2 3"]
     """Lower and upper corner of a world box that contains the content."""
     splits: dict[str, tuple[int, ...]]
-    """Views of `train`, `val` and `test`; the last two may be absent from a checkpoint. Of several captures also
-    `sources`, which adds to `train` the training views of those captures that are never trained on."""
+    """Views of `train`, `val` and `test`; the last two may be absent from a checkpoint. For several captures also
+    `sources`, which adds to `train` the training views of captures that are never trained on."""
     view_names: tuple[str, ...]
     background: Background
     to_user: Float64[Tensor, "4 4"]
-    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of meters."""
+    """Similarity from scene coordinates to the user's own frame, which may be a map's: millions of meters."""
     space: Space = "bounded"
     metres_per_unit: float | None = None
-    """How long a unit of the user's frame is; None: nobody has said."""
+    """Meters per unit of the user's frame; None: unknown."""
     capture_of: tuple[int, ...] | None = None
-    """Number of the capture that each view belongs to, where several were joined; None: one capture."""
+    """Number of each view's capture, if several were joined; None: one capture."""
     captures: tuple[str, ...] = ()
-    """The names of the captures that were joined."""
+    """The names of the joined captures."""
 
     @property
     def user_cameras(self) -> Cameras:
@@ -213,7 +213,7 @@ class SceneRecord:
 
     @property
     def trained_captures(self) -> tuple[str, ...]:
-        """The names of those that are trained on; of one capture its own."""
+        """The names of the captures that are trained on; for one capture, its own."""
         if self.capture_of is None:
             return (self.name,)
         numbers = {self.capture_of[view] for view in self.splits["train"]}
@@ -221,7 +221,7 @@ class SceneRecord:
 
     @property
     def sources(self) -> tuple[int, ...]:
-        """Views that may be looked at while others are rendered."""
+        """Views that may be used to render others."""
         return self.splits.get("sources") or self.splits["train"]
 
 
@@ -237,8 +237,8 @@ class Scene(SceneRecord):
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
     """Sparse points of a reconstruction, in scene units; there may be none."""
     depths: KnownDepths | None = None
-    """Of pixels of its photographs, where the capture says any."""
+    """Known depths of pixels of its photographs, if the capture has any."""
     left_out: tuple[str, ...] = ()
-    """Photographs of the capture that have no pose, and so are no views."""
+    """Photographs of the capture without a pose, which are not views."""
     refined: bool = False
-    """Whether its cameras learn with the model, or have learned: they stand near where the photographs were taken."""
+    """Whether its cameras are or were learned with the model: they are only near where the photographs were taken."""

@@ -1,4 +1,4 @@
-"""What structs of tensors can do."""
+"""Operations on structs of tensors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-# Not typing.Self, which runtime type checkers do not know.
+# Not typing.Self, which runtime type checkers do not support.
 Struct = TypeVar("Struct", bound="TensorStruct")
 
 
@@ -55,7 +55,7 @@ class TensorStruct:
 
 
 def concatenate(parts: Sequence[Struct]) -> Struct:
-    """Return structs of equal fields one after the other, tensor by tensor."""
+    """Concatenate structs with the same fields, tensor by tensor."""
     first, *_ = parts
     tensors = iter([torch.cat(each) for each in zip(*(part.tensors() for part in parts), strict=True)])
     return first.map(lambda _: next(tensors))

@@ -1,6 +1,6 @@
-"""When checkpoints are written: `last.ckpt` every so often and at the end, `best.ckpt` at the best validation.
+"""When checkpoints are written: `last.ckpt` regularly and at the end, `best.ckpt` at the best validation.
 
-The `last.ckpt` before stays as `previous.ckpt` (`checkpoints/writing.py` rotates them).
+The preceding `last.ckpt` is kept as `previous.ckpt` (`checkpoints/writing.py` rotates them).
 """
 
 from pathlib import Path
@@ -18,9 +18,9 @@ from nerf_lightning.training.step_guard import first_not_finite
 
 
 class Checkpoints(Callback):
-    """Keep the last, the one before, and the best.
+    """Keep the last checkpoint, the one before, and the best.
 
-    While gradients or weights are not finite nothing is saved, so that the last is one to go back to (`NanGuard`).
+    While gradients or weights are not finite nothing is saved, so that the last one is good to return to (`NanGuard`).
 
     Args:
         every_steps: steps between checkpoints (`last.ckpt`).
@@ -36,13 +36,13 @@ class Checkpoints(Callback):
         self.best: float | None = None
 
     def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
-        """Check that the trainer has who writes them, and remove what killed processes left of theirs.
+        """Check that the trainer has our writer, and remove partial files left by killed processes.
 
         Raises:
-            InputError: it has not.
+            InputError: it does not.
         """
         writer(trainer, self)
-        if self.folder(trainer).is_dir():  # a run that ends without a further step would leave them
+        if self.folder(trainer).is_dir():  # a run that ends without another step would leave them
             remove_leftovers(self.folder(trainer))
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
@@ -65,7 +65,7 @@ class Checkpoints(Callback):
             trainer.save_checkpoint(self.folder(trainer) / BEST)
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
-        """Write `last.ckpt` at the end, and wait until all is on the disk.
+        """Write `last.ckpt` at the end, and wait until everything is on disk.
 
         Raises:
             InputError: the weights are not finite, or a checkpoint could not be written.
@@ -74,28 +74,28 @@ class Checkpoints(Callback):
         writer(trainer, self).wait()
 
     def state_dict(self) -> dict[str, Any]:
-        """Remember the best across a resume."""
+        """Return the best value, for a resume."""
         return {"best": self.best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the best up again."""
+        """Restore the best value."""
         self.best = state_dict["best"]
 
     @staticmethod
     def folder(trainer: Trainer) -> Path:
-        """Return where the run's checkpoints lie."""
+        """Return the folder of the run's checkpoints."""
         return Path(trainer.default_root_dir) / "checkpoints"
 
 
 def writer(trainer: Trainer, callback: Callback) -> AtomicCheckpointIO:
-    """Return who writes the checkpoints.
+    """Return the plugin that writes the checkpoints.
 
     Args:
-        trainer: of the run.
-        callback: asks for it, for the message.
+        trainer: the run's trainer.
+        callback: the callback that needs it, for the message.
 
     Raises:
-        InputError: another plugin does, as in a trainer that was not made by `nerf train`.
+        InputError: the trainer uses another plugin, as when it was not made by `nerf train`.
     """
     plugin = trainer.strategy.checkpoint_io
     if not isinstance(plugin, AtomicCheckpointIO):
@@ -109,5 +109,5 @@ def writer(trainer: Trainer, callback: Callback) -> AtomicCheckpointIO:
 
 
 def _is_finite(train_step: TrainStep) -> bool:
-    """Return whether the run is one to come back to: its last step was taken, and its weights are finite."""
+    """Return whether the run is good to return to: its last step was taken, and its weights are finite."""
     return train_step.guard.in_row == 0 and not first_not_finite(train_step.objective.named_weights())

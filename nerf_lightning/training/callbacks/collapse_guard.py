@@ -1,4 +1,4 @@
-"""The collapse guard: a run that renders a constant picture is noticed early and begun anew."""
+"""The collapse guard: a run that renders a constant picture is detected early and restarted."""
 
 import logging
 from typing import Any, ClassVar
@@ -19,17 +19,17 @@ log = logging.getLogger(__name__)
 class CollapseGuard(Callback):
     """Restart a run whose renders stay constant while the photographs do not.
 
-    With ReLU densities and a white background a run may fall into "all is empty", where no gradient leads out. The sign
-    is the spread (standard deviation over rays) of the scene's own light, before the background: below
-    `ratio` times the spread of the targets at `patience` looks in a row. The restart draws new weights, a new order
-    of rays, and goes through the center crop again; steps already taken are not given back.
+    With ReLU densities and a white background, a run may fall into the state "all is empty", which has no gradient. The
+    criterion is the spread (standard deviation over rays) of the scene's own light, before the background: below
+    `ratio` times the spread of the targets at `patience` consecutive checks. The restart draws new weights and a new
+    order of rays, and repeats the center crop; steps already taken still count.
 
     Args:
-        every_steps: steps between two looks at the renders.
-        until_step: steps after the crop from which on the guard trusts the run.
-        patience: looks in a row that must fail.
-        ratio: smallest share of the targets' spread that counts as alive.
-        max_restarts: how often it restarts at most.
+        every_steps: steps between two checks of the renders.
+        until_step: steps after the crop from which the guard trusts the run.
+        patience: number of consecutive checks that must fail.
+        ratio: minimum share of the targets' spread that counts as alive.
+        max_restarts: maximum number of restarts.
 
     Raises:
         InputError: `every_steps` or `patience` is below 1.
@@ -52,7 +52,7 @@ class CollapseGuard(Callback):
         self.failed = 0
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Look now and then, and log a restart."""
+        """Check regularly, and log a restart."""
         batches, optimizer = trainer.datamodule.batches, pl_module.optimizers().optimizer  # type: ignore[attr-defined]
         message = self.look(pl_module.train_step, batches, optimizer, outputs["step"], trainer.global_step)
         if message is None:
@@ -63,17 +63,17 @@ class CollapseGuard(Callback):
             writer.add_text("collapse_guard", message, trainer.global_step)
 
     def look(self, train_step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
-        """Look, where it is time, and restart a run that has collapsed.
+        """Check when it is time, and restart a run that has collapsed.
 
         Args:
-            train_step: of the run, after a step of it.
-            batches: of the run.
-            optimizer: of the run.
-            output: what the step saw.
-            num_steps: taken so far, those of earlier attempts included.
+            train_step: the run's training step, after a step.
+            batches: the run's batches.
+            optimizer: the run's optimizer.
+            output: the step's output.
+            num_steps: steps taken so far, including those of earlier attempts.
 
         Returns:
-            What was done; None: nothing.
+            A description of what was done; None: nothing.
         """
         progress = train_step.progress
         after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
@@ -101,24 +101,24 @@ class CollapseGuard(Callback):
         return message
 
     def state_dict(self) -> dict[str, Any]:
-        """Remember the looks across a resume."""
+        """Return the count of failed checks, for a resume."""
         return {"failed": self.failed}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the count up again."""
+        """Restore the count."""
         self.failed = state_dict["failed"]
 
 
 def whole_batch(output: StepOutput) -> dict[str, torch.Tensor]:
-    """Return what all processes saw of a step's rays."""
+    """Return the rays of a step from all processes."""
     parts = ranks.gather({name: getattr(output, name).cpu() for name in ("foreground", "target", "weight")})
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def is_constant(seen: dict[str, torch.Tensor], ratio: float) -> bool:
-    """Return whether the light that the field itself sends is the same for all rays, unlike the photographs.
+    """Return whether the scene's own light is the same for all rays, unlike the photographs.
 
-    Rays of masked pixels do not count: nothing has told the field what lies there.
+    Rays of masked pixels do not count: the field has not learned what is there.
     """
     seen = {name: value.cpu() for name, value in seen.items()}
     kept = seen["weight"] > 0

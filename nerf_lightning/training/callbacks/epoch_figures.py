@@ -14,7 +14,7 @@ from nerf_lightning.visualization.pictures import save_png
 
 
 class EpochFigures(Callback):
-    """Draw the figure after every so many epochs, an epoch being every training ray once.
+    """Draw the figure every `every_epochs` epochs, an epoch being every training ray once.
 
     Args:
         every_epochs: epochs between two figures.
@@ -31,7 +31,7 @@ class EpochFigures(Callback):
         self.losses: list[float] = []
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Collect the loss; draw when an epoch has ended."""
+        """Collect the loss, and draw when an epoch has ended."""
         if trainer.global_step % self.every_steps == 0:
             self.steps.append(trainer.global_step)
             self.losses.append(float(outputs["step"].losses.cpu().sum()))
@@ -49,11 +49,11 @@ class EpochFigures(Callback):
             save_png(folder / "loss_curve.png", loss_curve(self.steps, self.losses))
 
     def state_dict(self) -> dict[str, Any]:
-        """Remember the curve across a resume."""
+        """Return the curve, for a resume."""
         return {"steps": self.steps, "losses": self.losses}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the curve up again."""
+        """Restore the curve."""
         self.steps, self.losses = list(state_dict["steps"]), list(state_dict["losses"])
 
     def _draw(self, trainer: Trainer, system: Any, epoch: int) -> None:

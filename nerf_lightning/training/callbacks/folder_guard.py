@@ -1,4 +1,4 @@
-"""A run whose folder is deleted or renamed stops: it would go on in one that has only what was written since."""
+"""Stop a run whose folder is deleted or renamed: it would continue in one with only what was written since."""
 
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,10 @@ from nerf_lightning.files.made_folders import require_run
 
 
 class FolderGuard(Callback):
-    """Look after each step whether the run folder is still there, before anything is written."""
+    """Check after each step that the run folder still exists, before anything is written."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Stop where it is not.
+        """Stop if it does not.
 
         Raises:
             InputError: the folder was deleted, moved or renamed.

@@ -1,4 +1,4 @@
-"""What loggers show of a run besides its curves: the config as text, and a row in the hyper-parameter table."""
+"""What loggers show of a run besides its curves: the config as text, and a row in the hyperparameter table."""
 
 from itertools import islice
 from typing import Any
@@ -13,12 +13,12 @@ from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.training.tensorboard import shown_name
 
 MOST = 15
-"""Columns of the table of hyper-parameters: of more, nobody finds those that matter."""
+"""Maximum number of columns of the hyperparameter table: with more, those that matter are hard to find."""
 FINAL_METRICS = ("test/psnr", "test/ssim")
 
 
 def describe_run(loggers: list[Logger], config: DictConfig) -> None:
-    """Write the hyper-parameters, and for TensorBoard the config as text.
+    """Write the hyperparameters, and for TensorBoard the config as text.
 
     TensorBoard fills in the metrics of its table from the scalars of the same names.
     """
@@ -36,11 +36,11 @@ def describe_run(loggers: list[Logger], config: DictConfig) -> None:
 
 
 def hyper_parameters(config: DictConfig, given: list[str]) -> dict[str, Any]:
-    """Return scene, model and seed, and what else was given by which runs differ, as TensorBoard takes them.
+    """Return scene, model, seed and other settings in which runs may differ, as TensorBoard takes them.
 
     Args:
         config: all settings.
-        given: the overrides of the command line; what they leave alone is as by default.
+        given: the overrides of the command line; all else has its default.
     """
     choices = HydraConfig.get().runtime.choices
     values = {"model": str(choices.get("model")), "scene": str(choices.get("scene")), "seed": config.get("seed")}

@@ -19,7 +19,7 @@ GIGABYTE = 1e9
 class Monitor(Watcher):
     """Log losses, PSNR (dB), speed, memory (gigabytes) and gradients every few steps.
 
-    They go straight to the loggers: `LightningModule.log` would cost more than a small step.
+    They go directly to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
         every_steps: steps between two points of the curves.
@@ -31,7 +31,7 @@ class Monitor(Watcher):
         self.rays_seen = 0
 
     def is_time(self, step: int, last_step: int) -> bool:
-        """See `Watcher`; a run that is too short for two rows gets about ten."""
+        """See `Watcher`; a run too short for two rows gets about ten."""
         is_short = last_step < 2 * self.every_steps
         return step % max(last_step // 10, 1) == 0 if is_short else super().is_time(step, last_step)
 
@@ -41,12 +41,12 @@ class Monitor(Watcher):
         self.rays_seen = pl_module.train_step.progress.rays_seen
 
     def leave_out(self, seconds: float) -> None:
-        """Do not count the last so many seconds: the training paused."""
+        """Do not count the last `seconds`: training was paused."""
         self.since += seconds
 
     def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
-        """Return whether the step that begins gets a row, and so has to measure the norms of its gradients."""
-        # XLA would compile the steps that get a row and those that do not as two programs.
+        """Return whether the next step gets a row, and so has to measure the norms of its gradients."""
+        # XLA would compile steps with and without a row as two programs.
         return system.device.type == "xla" or self.is_time(
             trainer.global_step + 1, int(trainer.estimated_stepping_batches)
         )
@@ -81,18 +81,18 @@ class Monitor(Watcher):
 def level_scalars(
     names: tuple[str, ...], losses: Tensor, errors: Tensor, pictures: tuple[str, ...]
 ) -> dict[str, float]:
-    """Return what is logged of the levels of a step.
+    """Return the scalars to log for a step's levels.
 
     Args:
-        names: of the levels.
-        losses: of each, of whatever kind.
-        errors: the mean squared error of the colors that each shows.
-        pictures: the names of the levels that show some, whose PSNR is logged.
+        names: names of the levels.
+        losses: loss of each, of any kind.
+        errors: mean squared error of each level's colors.
+        pictures: names of the levels that render pictures, whose PSNR is logged.
     """
     losses, shown = torch.stack([losses, psnr(errors)]).cpu()  # the device is read once
     values = {"train/loss": float(losses.sum())}
     for name, loss, quality in zip(names, losses, shown, strict=True):
-        if len(names) > 1:  # else it is the sum
+        if len(names) > 1:  # else it equals the sum
             values[f"train/loss_{name}"] = float(loss)
         if name in pictures:
             values[f"train/psnr_{name}"] = float(quality)

@@ -1,4 +1,4 @@
-"""The NaN guard: a run whose numbers are not finite any more is stopped, or goes back and on at a lower rate."""
+"""The NaN guard: a run whose numbers are no longer finite is stopped, or rolled back and continued at a lower rate."""
 
 import logging
 from dataclasses import replace
@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 
 
 class NanGuard(Callback):
-    """End or mend a run that learns nothing any more because its numbers are not finite.
+    """Stop or repair a run that no longer learns because its numbers are not finite.
 
-    A step whose gradients are not finite is left out (`StepGuard`); `patience` of them in a row, or weights that are
-    not finite, are the sign. A rollback takes weights, optimizer and place from the last good checkpoint, or begins
-    anew where there is none, and goes on with other random numbers at a lower learning rate: a new attempt. Steps
-    already taken are not given back. Rate and attempt are part of the checkpoints that follow.
+    A step whose gradients are not finite is skipped (`StepGuard`); `patience` of them in a row, or nonfinite weights,
+    trigger the guard. A rollback restores weights, optimizer and progress from the last good checkpoint, or starts over
+    if there is none, and continues with other random numbers at a lower learning rate: a new attempt. Steps already
+    taken still count. Rate and attempt are part of subsequent checkpoints.
 
     Args:
         on_nan: stop ends the run; rollback returns to the last good checkpoint and continues at a lower learning rate.
@@ -57,24 +57,24 @@ class NanGuard(Callback):
         self.factor, self.max_rollbacks = factor, max_rollbacks
 
     def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
-        """See that there will be checkpoints to go back to, or to name.
+        """Check that there will be checkpoints to return to, or to name.
 
         Raises:
-            InputError: others are written than those.
+            InputError: the checkpoints are written by something else.
         """
         writer(trainer, self)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Look whether the run still learns.
+        """Check whether the run still learns.
 
         Raises:
-            InputError: it does not, and is not to be rolled back, or was too often.
+            InputError: it does not, and rollbacks are off or exhausted.
         """
         if cause := self.cause(pl_module.train_step):
             self._act(trainer, pl_module, cause)
 
     def cause(self, train_step: TrainStep) -> str | None:
-        """Say why a run learns nothing any more, after a step of it; None: it does, or it was not the time to look."""
+        """Return why a run no longer learns, after a step; None: it does, or it was not time to check."""
         guard, number = train_step.guard, train_step.progress.step
         looks = number % self.every_steps == 0
         if (looks or train_step.device.type == "cpu") and guard.in_row >= self.patience:
@@ -117,7 +117,7 @@ class NanGuard(Callback):
             lowered = content["nerf_lightning"]["progress"]["rollbacks"]
         count_rollback(train_step, former, skipped)
         for group in system.optimizers().param_groups:
-            # The rate in the checkpoint may be that of before an earlier rollback.
+            # The rate in the checkpoint may be from before an earlier rollback.
             group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (former.rollbacks + 1 - lowered)
 
     def _advice(self, trainer: Trainer, good: Path | None) -> str:

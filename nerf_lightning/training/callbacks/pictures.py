@@ -1,4 +1,4 @@
-"""Pictures for the loggers: a validation view every so often, and where the cameras stand."""
+"""Pictures for the loggers: a validation view at intervals, and the camera layout."""
 
 import time
 from pathlib import Path
@@ -19,7 +19,7 @@ from nerf_lightning.visualization.pictures import mosaic, panels, save_png, to_b
 
 USUAL_STEPS = 1000
 MOST_OF_TIME = 0.05
-"""What pictures may take of a training's time where nobody has said how many there are to be."""
+"""Share of the training time that pictures may take, unless their number is set."""
 
 
 class ValidationPictures(Watcher):
@@ -41,7 +41,7 @@ class ValidationPictures(Watcher):
         return step == last_step or (super().is_time(step, last_step) and not waits)
 
     def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
-        """Render the view, and save its pictures."""
+        """Render the view, and log its pictures."""
         if not trainer.is_global_zero:
             return
         began, step = time.perf_counter(), trainer.global_step
@@ -59,10 +59,10 @@ class ValidationPictures(Watcher):
 
 
 class CameraLayout(Callback):
-    """Draw where the cameras stand once, after the first step, so that the drawing does not delay the start."""
+    """Draw the camera layout once, after the first step, so that the drawing does not delay the start."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Draw, if this was the first step of the run."""
+        """Draw if this was the first step of the run."""
         if trainer.global_step == 1 and trainer.loggers:
             scene = shown_capture(trainer.datamodule.scene)  # type: ignore[attr-defined]
             show_picture(trainer.loggers, "scene/cameras", layout_picture(scene), 0)

@@ -1,4 +1,4 @@
-"""One line that says how far the training is: step, loss, PSNR, rays per second, time left."""
+"""One line with the progress of training: step, loss, PSNR, rays per second, time left."""
 
 import logging
 import time
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class TrainingProgress(ProgressBar):
-    """A bar on a terminal; elsewhere a line in the log now and then.
+    """A bar on a terminal; elsewhere an occasional line in the log.
 
     Args:
         refresh_seconds: time between two updates of the bar; the loss is read from the device only then.
@@ -36,7 +36,7 @@ class TrainingProgress(ProgressBar):
         self.first_step, self.shown, self.rays_seen = 0, 0.0, 0
 
     def disable(self) -> None:
-        """Stay silent: Lightning asks it of every process but the first."""
+        """Stay silent: Lightning calls this in every process but the first."""
         self.silent = True
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
@@ -60,13 +60,13 @@ class TrainingProgress(ProgressBar):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
-        if self.started is None:  # the first step compiles kernels, and says nothing of the others
+        if self.started is None:  # the first step compiles kernels, and is not representative
             self.started = self.shown = now
             self.first_step, self.rays_seen = step, pl_module.train_step.progress.rays_seen
             return
         if self.silent or now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
-        # Negative after a restart, which counts anew.
+        # Negative after a restart, which resets the count.
         rays_per_second = max(0.0, (pl_module.train_step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.train_step.progress.rays_seen
         output: StepOutput = outputs["step"]
@@ -81,12 +81,12 @@ class TrainingProgress(ProgressBar):
             log.info("step %s  %s%s", where, text, left and f"  {left}")
 
     def _left(self, step: int, total: int, seconds: float) -> str:
-        """Return the time left after so many seconds, once enough of the run is over to know it."""
+        """Return the time left after `seconds`, once enough of the run is over to estimate it."""
         done, asked = step - self.first_step, total - self.first_step
         return "" if done < max(1, FORESEEN_FROM * asked) else f"about {spoken((total - step) * seconds / done)} left"
 
     def leave_out(self, seconds: float) -> None:
-        """Do not count the last so many seconds: the training paused."""
+        """Do not count the last `seconds`: training was paused."""
         if self.started is not None:
             self.started += seconds
         self.shown += seconds
@@ -96,7 +96,7 @@ class TrainingProgress(ProgressBar):
         self._stop(trainer.global_step)
 
     def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
-        """Give the terminal back."""
+        """Release the terminal."""
         self._stop(trainer.global_step)
 
     def _stop(self, step: int) -> None:
@@ -107,7 +107,7 @@ class TrainingProgress(ProgressBar):
 
 
 def _total(trainer: Trainer, pl_module: Any) -> int | None:
-    """Return the length of the run in steps; with a time budget an estimate, None where there is none yet."""
+    """Return the length of the run in steps; with a time budget an estimate, None if there is none yet."""
     total = pl_module.train_step.num_steps
     if total >= MOST_STEPS:
         return None

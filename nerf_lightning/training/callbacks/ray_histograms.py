@@ -1,4 +1,4 @@
-"""Histograms for TensorBoard: where along the rays each level sees something, and on how many samples that rests."""
+"""Histograms for TensorBoard: where along the rays each level sees something, and from how many samples."""
 
 from typing import Any
 
@@ -20,14 +20,14 @@ PARTS = 50
 
 
 class RayHistograms(Watcher):
-    """Render some of the step's rays again, as training does, and tell for each level what lies along them.
+    """Render some of the step's rays again, as in training, and log for each level what is along them.
 
-    A coarse level that has learned nothing spreads its weight evenly. Weight that piles up at 0 or 1 lies at the near
-    or far bound, which then cuts off the scene.
+    A coarse level that has learned nothing spreads its weight evenly. Weight that piles up at 0 or 1 is at the near or
+    far bound, which then cuts off the scene.
 
     Args:
         every_steps: steps between two histograms.
-        num_rays: number of rays of a step that are used.
+        num_rays: number of a step's rays that are used.
     """
 
     def __init__(self, every_steps: int = 250, num_rays: int = 256):
@@ -43,7 +43,7 @@ class RayHistograms(Watcher):
         step, contracted_spacing = trainer.global_step, trainer.datamodule.scene.space == "contracted"
         seen = look_along(system.train_step, outputs["step"].pixels[: self.num_rays], step, contracted_spacing)
         for name, (along, samples) in seen.items():
-            lit = samples[samples > 0]  # many rays meet nothing at all
+            lit = samples[samples > 0]  # many rays meet nothing
             for writer in writers:
                 write_shares(writer, f"{ALONG_RAYS}_{name}", along, step)
                 if lit.numel():
@@ -55,7 +55,7 @@ class RayHistograms(Watcher):
 def look_along(
     train_step: TrainStep, pixels: PixelIndex, step: int, contracted_spacing: bool
 ) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
-    """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
+    """Return for each level the mean weight in equal parts of the ray, and each ray's effective samples."""
     objective, tile_points = train_step.objective, train_step.tiles.picture_points
     model, rays = objective.model, objective.rays(pixels)
     names, num_rays = model.level_names, rays.near.numel()
@@ -74,7 +74,7 @@ def look_along(
 
 
 def write_shares(writer: SummaryWriter, tag: str, shares: Float[Tensor, "parts"], step: int) -> None:
-    """Write a histogram over [0, 1] whose bars are given."""
+    """Write a histogram over [0, 1] with the given bars."""
     shares = shares.double()
     middles = (torch.arange(len(shares), dtype=torch.double) + 0.5) / len(shares)
     writer.add_histogram_raw(

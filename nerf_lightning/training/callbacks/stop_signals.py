@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, a scheduler's signal, a sweep's stop: finish the step, save, stop; the run can go on to the bit."""
+"""On Ctrl-C, SIGTERM, a scheduler's signal or a sweep's stop: finish the step, save, stop; a resume is bit-exact."""
 
 import os
 import signal
@@ -14,16 +14,16 @@ from nerf_lightning.training.launch.preemption import stop_signals
 
 
 class StopSignals(Callback):
-    """Set a flag in the handler, and stop at a step's end.
+    """Set a flag in the signal handler, and stop at the end of a step.
 
-    The checkpoint itself is written when the training ends (`Checkpoints`). A handler that saved by itself would save
-    half a step. A second Ctrl-C stops at once.
+    The checkpoint itself is written when training ends (`Checkpoints`). A handler that saved would save half a step. A
+    second Ctrl-C stops at once.
     """
 
     def __init__(self) -> None:
         self.received: int | None = None
         self.stop_file: Path | None = None
-        """Asks for a stop once it is there, like SIGTERM, which on Windows would end the process at once."""
+        """A file whose existence requests a stop, like SIGTERM, which on Windows would end the process at once."""
         self.heard = False  # a signal, not only the file
         self.former: dict[int, Any] = {}
 
@@ -36,23 +36,24 @@ class StopSignals(Callback):
         self._listen()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Listen; Lightning puts a handler of its own in place shortly before.
+        """Listen; Lightning installs its own handler shortly before.
 
         Raises:
-            SystemExit: that one has heard a signal. No step was taken, so there is nothing to save (`preemption`).
+            SystemExit: that handler has received a signal. No step was taken, so there is nothing to save
+                (`preemption`).
         """
         if ranks.largest(float(trainer.received_sigterm)):
             raise SystemExit(128 + signal.SIGTERM)
         self._listen()
 
     def asked_to_stop(self) -> bool:
-        """Return whether a signal or the file asks for a stop."""
+        """Return whether a signal or the file requests a stop."""
         if self.received is None and self.stop_file is not None and self.stop_file.exists():
             self.received = signal.SIGTERM
         return self.received is not None
 
     def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Stop where the step is whole, all processes at the same one."""
+        """Stop after a complete step, all processes at the same one."""
         self.asked_to_stop()
         received = int(ranks.largest(float(self.received or 0)))
         if received:
@@ -60,7 +61,7 @@ class StopSignals(Callback):
             trainer.should_stop = True
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Give the handlers back."""
+        """Restore the handlers."""
         for number, handler in self.former.items():
             signal.signal(number, handler)
         self.former.clear()
@@ -71,5 +72,5 @@ class StopSignals(Callback):
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.heard and number == signal.SIGINT:
-            os._exit(128 + number)  # an exception would be caught on the way, and the process linger
+            os._exit(128 + number)  # an exception would be caught on the way, and the process would linger
         self.heard, self.received = True, number

@@ -1,4 +1,4 @@
-"""Train the best that a given time allows: the schedule follows the measured speed, and ends with the time."""
+"""Train as well as a given time allows: the schedule follows the measured speed, and ends with the time."""
 
 import math
 import signal
@@ -16,7 +16,7 @@ from nerf_lightning.messages.errors import InputError
 
 @dataclass
 class Used:
-    """What has been used of a budget, as a checkpoint keeps it."""
+    """The used part of a budget, as stored in a checkpoint."""
 
     used: float
     """Seconds,"""
@@ -25,15 +25,15 @@ class Used:
 
 
 class TimeBudget(Callback):
-    """Stop after so many seconds of training, and stretch the schedule to just that length.
+    """Stop after `seconds` of training, and stretch the schedule to exactly that length.
 
     The time that a run has used is part of its state, so a resumed run has the rest; one that had no budget before has
-    all of it. While the process is stopped (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used, nor by
-    the first step of a process, which may compile kernels for half a minute. Such a run is not repeatable to the bit:
-    how many steps fit depends on the machine.
+    all of it. The time while the process is stopped (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) does not count,
+    nor does the first step of a process, which may compile kernels for half a minute. Such a run is not
+    bit-reproducible: how many steps fit depends on the machine.
 
     Args:
-        seconds: training time in all, validation included.
+        seconds: total training time, including validation.
         every_steps: steps between two estimates of the run's length.
     """
 
@@ -47,7 +47,7 @@ class TimeBudget(Callback):
         self.former: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        """Notice when the process is woken; a resumed run knows how fast it was."""
+        """Install a handler that notices when the process continues; a resumed run knows how fast it was."""
         if hasattr(signal, "SIGCONT"):
             self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
@@ -59,7 +59,7 @@ class TimeBudget(Callback):
         """Estimate the length of the run, and stop when time is over; the first step compiles, and is not counted."""
         now = time.perf_counter()
         if not self.compiles:
-            # All processes stop at the same step: the slowest clock is everybody's.
+            # All processes stop at the same step: the slowest clock counts for all.
             self.used = ranks.largest(self.used + now - self.since)
         self.compiles, self.since = False, now
         if self.used and pl_module.train_step.progress.step % self.every_steps == 0:
@@ -68,26 +68,26 @@ class TimeBudget(Callback):
             trainer.should_stop = True
 
     def leave_out(self, seconds: float) -> None:
-        """Do not count the last so many seconds: the training paused."""
+        """Do not count the last `seconds`: training was paused."""
         self.since += seconds
 
     def teardown(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
-        """Give the handler back."""
+        """Restore the handler."""
         if self.former is not None:
             signal.signal(signal.SIGCONT, self.former)
             self.former = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Remember the time used, across a resume."""
+        """Return the time used, for a resume."""
         return asdict(Used(self.used, self.first))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the count up again."""
+        """Restore the count."""
         known = Used(**state_dict)
         self.used, self.first = known.used, known.first
 
     def _woken(self, number: int, frame: FrameType | None) -> None:
-        # When the stop began is not known: what was done of the step is left out with it.
+        # When the stop began is unknown, so the part of the step before it does not count either.
         self.since = time.perf_counter()
 
     def _fit_schedule(self, trainer: Trainer, train_step: Any) -> None:

@@ -1,4 +1,4 @@
-"""How long a training takes by itself: without what comes before its first step, and after its last."""
+"""The time of training itself, without what comes before its first step and after its last."""
 
 import time
 from typing import Any, Protocol, runtime_checkable
@@ -9,14 +9,14 @@ from lightning.pytorch.callbacks import Callback
 
 @runtime_checkable
 class Clocked(Protocol):
-    """A callback that measures time, in which pauses of the training are not to be counted."""
+    """A callback that measures time, in which pauses of training must not count."""
 
     def leave_out(self, seconds: float) -> None:
-        """Do not count the last so many seconds."""
+        """Do not count the last `seconds`."""
 
 
 class TrainingTime(Callback):
-    """Measure the time from the first step of this start to the end of the last one, validation in between included."""
+    """Measure the time from the first step of this start to the end of the last, including validation in between."""
 
     def __init__(self) -> None:
         self.seconds, self.since = 0.0, 0.0
@@ -31,5 +31,5 @@ class TrainingTime(Callback):
         self.seconds, self.since = self.seconds + now - self.since, now
 
     def leave_out(self, seconds: float) -> None:
-        """Do not count the last so many seconds: the training paused."""
+        """Do not count the last `seconds`: training was paused."""
         self.since += seconds

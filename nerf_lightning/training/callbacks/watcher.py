@@ -1,4 +1,4 @@
-"""What looks at a run every few steps, the view that it renders, and its direct way to TensorBoard."""
+"""Callbacks that observe a run every few steps, the view they render, and their direct access to TensorBoard."""
 
 import threading
 from abc import abstractmethod
@@ -18,12 +18,12 @@ from nerf_lightning.visualization.pictures import LONGEST_PANEL
 
 
 class Watcher(Callback):
-    """Look when it is time.
+    """Observe the run at intervals.
 
-    Nothing that training reads may be changed.
+    Subclasses must not change anything that training reads.
 
     Args:
-        every_steps: steps between two looks.
+        every_steps: steps between two observations.
     """
 
     def __init__(self, every_steps: int):
@@ -31,24 +31,24 @@ class Watcher(Callback):
         self.every_steps = every_steps
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """Look when it is time."""
+        """Observe when it is time."""
         if self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches)):
             self.watch(trainer, pl_module, outputs)
 
     def is_time(self, step: int, last_step: int) -> bool:
-        """Return whether to look after a step."""
+        """Return whether to observe after a step."""
         return step % self.every_steps == 0
 
     @abstractmethod
     def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
-        """Look at the run, and at what its last step returned.
+        """Observe the run and the output of its last step.
 
-        Every process of it is asked, the loggers are the first one's.
+        This is called in every process; only the first has the loggers.
         """
 
 
 WRITES = "tensorboard.summary.writer.event_file_writer"
-"""Where the class of the thread that writes is defined."""
+"""Module that defines the class of the writer thread."""
 
 
 def tensorboard_writers(loggers: Sequence[Logger]) -> list[SummaryWriter]:
@@ -58,7 +58,7 @@ def tensorboard_writers(loggers: Sequence[Logger]) -> list[SummaryWriter]:
 
 @contextmanager
 def errors_told_once() -> Iterator[None]:
-    """Let TensorBoard's threads print nothing when they cannot write, as where the disk is full.
+    """Keep TensorBoard's threads from printing when they cannot write, as when the disk is full.
 
     They keep the error, and raise it at the next write or flush.
     """
@@ -74,7 +74,7 @@ def errors_told_once() -> Iterator[None]:
     finally:
         for thread in filter(_writes, threading.enumerate()):
             if getattr(thread, "exception", None) is not None:
-                thread.join()  # it is about to say so
+                thread.join()  # it is about to raise
         threading.excepthook = former
 
 
@@ -83,9 +83,9 @@ def _writes(thread: threading.Thread | None) -> bool:
 
 
 def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
-    """Return the number-th validation view (counted round) and its picture, in the precision of training.
+    """Return validation view `number` (modulo their count) and its picture, in the precision of training.
 
-    Where there are none, of the training views. The picture is no larger than what is shown of it.
+    If there are none, a training view. The picture is no larger than needed to show it.
     """
     scene = trainer.datamodule.scene
     views = scene.splits["val"] or scene.splits["train"]

@@ -1,11 +1,12 @@
-"""A batch's way forward and back, recorded once as a CUDA graph and replayed for each batch of its size.
+"""A batch's forward and backward pass, recorded once as a CUDA graph and replayed for each batch of its size.
 
-A step of a small model asks for hundreds of kernels that each take a few microseconds, and Python takes longer to ask
-than the GPU to compute. A replayed graph asks once (https://pytorch.org/blog/accelerating-pytorch-with-cuda-graphs/).
+A step of a small model launches hundreds of kernels that each take a few microseconds, and Python takes longer to
+launch them than the GPU to compute. A replayed graph is launched once
+(https://pytorch.org/blog/accelerating-pytorch-with-cuda-graphs/).
 
-What is recorded is what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
-of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and what
-a model decides on the host between two steps has recordings of its own (`Part.step_variant`).
+A recording contains what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
+of a batch) would stay constant. So everything that changes between steps is passed in tensors at fixed addresses, and
+each decision of a model on the host has its own recordings (`Part.step_variant`).
 """
 
 import logging
@@ -26,28 +27,29 @@ from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradien
 from nerf_lightning.training.step_guard import StepGuard
 
 KNOWN = (__name__.partition(".")[0], "torch")
-"""Packages of whose modules it is known whether a recorded step follows them."""
-# The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
+"""Packages for whose modules it is known whether recorded steps can be replayed."""
+# The first round compiles kernels and allocates what stays; CUDA's guide recommends a few.
 WARM_UPS = 3
 
 log = logging.getLogger(__name__)
 
 Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOutput]]
-"""Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
+"""Takes work; returns a function that repeats it on the same memory, and its result, which each repetition
+overwrites."""
 
 
 class CudaGraphs:
-    """Record work as CUDA graphs, each after a few rounds on a stream of their own.
+    """Record work as CUDA graphs, each after a few rounds on a separate stream.
 
-    All share the memory of what is under way, as no two run at a time and none reads what another has left: many sizes
-    of batches take as much memory as the largest.
+    All share the memory of intermediate results, since no two run at a time and none reads what another has left: many
+    batch sizes take as much memory as the largest.
     """
 
     def __init__(self) -> None:
         self.pool: Any = None
 
     def __call__(self, work: Callable[[], StepOutput]) -> tuple[Callable[[], None], StepOutput]:
-        """Return what does the work again, and what the work returned."""
+        """Return a function that repeats the work, and its result."""
         if self.pool is None:
             self.pool = torch.cuda.graph_pool_handle()
         graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
@@ -64,7 +66,7 @@ class CudaGraphs:
 
 @dataclass(frozen=True)
 class _Recording:
-    """One size of batches."""
+    """A recording for one batch size."""
 
     batch: Batch
     weight: Tensor
@@ -75,21 +77,21 @@ class _Recording:
 
 
 class RecordedGradients:
-    """Compute the gradients of batches, whole, by replaying the first of their size, share and parts' variants.
+    """Compute the gradients of whole batches by replaying the first one of the same size, share and step variants.
 
     Args:
-        tiles: computes them.
-        guard: sets those of a step to zero that are not finite, where one process has all of them.
+        tiles: computes the gradients.
+        guard: sets a step's nonfinite gradients to zero, if one process has all of them.
         record: makes a recording; None: CUDA graphs.
 
     Raises:
-        InputError: something here decides on the host what a step computes.
+        InputError: a part decides on the host what a step computes.
     """
 
     guards: bool
-    """Whether gradients that are not finite are zeros already."""
+    """Whether nonfinite gradients have already been set to zero."""
     replays = True
-    """Whether batches are replayed: until a recording is refused."""
+    """Whether batches are replayed, until a recording is refused."""
 
     def __init__(self, tiles: TileGradients, guard: StepGuard, record: Recorder | None = None):
         if kinds := not_replayed(tiles.objective):
@@ -99,15 +101,15 @@ class RecordedGradients:
             )
         self.tiles, self.guard, self.record = tiles, guard, CudaGraphs() if record is None else record
         self.parts, self.parameters = list(parts_of(tiles.objective)), list(tiles.objective.parameters())
-        self.guards = ranks.world_size() == 1  # else the gradients of all are added up first
+        self.guards = ranks.world_size() == 1  # else the gradients of all processes are summed first
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
     def __call__(
         self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
     ) -> StepOutput:
-        """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones.
+        """Return a batch's output; its gradients replace the previous ones in the parameters.
 
-        Both are written over by the next call. Where batches cannot be recorded, do as `TileGradients` does, which has
+        The next call overwrites both. If batches cannot be recorded, this does the same as `TileGradients`, which has
         the same arguments.
         """
         if self.replays:
@@ -146,7 +148,7 @@ class RecordedGradients:
 
         def work() -> StepOutput:
             for parameter in self.parameters:
-                # Others begin with zeros: the optimizer leaves them so (`optimizers.table_adam`).
+                # Others are zero already: the optimizer leaves them so (`optimizers.table_adam`).
                 if parameter.grad is not None and not getattr(parameter, "grad_in_place", False):
                     parameter.grad.zero_()
             seen = self.tiles.in_tiles_of(batch.num_rays, batch, share, kept_key)
@@ -166,18 +168,18 @@ class RecordedGradients:
 
 
 def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
-    """Copy tensors; those of one type in one kernel."""
+    """Copy tensors, those of one dtype in one kernel."""
     for dtype in {each.dtype for each in targets}:
         ours, theirs = ([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources))
         torch._foreach_copy_(ours, theirs)
 
 
 def not_replayed(objective: Objective, only_known: bool = False) -> list[str]:
-    """Return the classes of those parts whose steps a recording would not follow, each once.
+    """Return the classes of the parts whose steps cannot be replayed, each once.
 
     Args:
-        objective: what would be recorded.
-        only_known: those of somebody else's classes, too, that do not say themselves whether it would (`Part.replays`).
+        objective: the objective to record.
+        only_known: also return other packages' classes that do not set `Part.replays` themselves.
     """
     found = {}
     for module in objective.modules():

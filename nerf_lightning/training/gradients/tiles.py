@@ -1,9 +1,9 @@
-"""Gradients of a share of a step's batch, tile by tile; smaller tiles where there is no memory for these.
+"""Gradients of a share of a step's batch, tile by tile, with smaller tiles if memory runs out.
 
-What a tile of rays needs stays in the cache, and the sum of the tiles' gradients is the whole batch's up to rounding.
-Tiles go through the model beside each other on a CPU's cores, else in turn. Most operations of a step are too small to
-be shared out one by one: two threads that take a tile each, forward and backward, are almost twice as fast as one, but
-two threads in every operation gained a fifth.
+The data of a tile of rays stays in the cache, and the sum of the tiles' gradients is the whole batch's up to rounding.
+Tiles go through the model in parallel on a CPU's cores, elsewhere in turn. Most operations of a step are too small to
+be parallelized one by one: two threads that take a tile each, forward and backward, are almost twice as fast as one,
+but two threads in every operation gained a fifth.
 """
 
 import logging
@@ -26,13 +26,13 @@ from nerf_lightning.nerf.part import coupled_parts, sample_counts
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.types.rays import Batch
 
-# Points of a tile where pictures are rendered beside steps that are not cut into tiles.
+# Points per tile when rendering pictures between steps that are not cut into tiles.
 WHOLE_BATCH_POINTS = 65_536
 
 log = logging.getLogger(__name__)
 
 Backward = Callable[[Tensor], None]
-"""Adds the gradients of a loss to those of the parameters."""
+"""Adds a loss's gradients to the parameters'."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Share:
     """A process's part of a step's batch."""
 
     first: int
-    """Its first ray's slot in the batch."""
+    """Slot of its first ray in the batch."""
     num_rays: int
     """Rays of the whole batch."""
     weight: Tensor
@@ -48,7 +48,7 @@ class Share:
 
     @classmethod
     def whole(cls, batch: Batch) -> "Share":
-        """Return all of a batch."""
+        """Return the share that is the whole batch."""
         return cls(0, batch.num_rays, batch.weight.sum())
 
 
@@ -62,8 +62,8 @@ class TileGradients:
 
     Args:
         objective: the loss.
-        points: most points that a tile may send through a field at once; None: the whole batch is a tile, as it is
-            where a part looks at all rays of a step (`Part.couples_rays`).
+        points: maximum number of points that a tile may send through a field at once; None: the whole batch is one
+            tile, as required if a part depends on all rays of a step (`Part.couples_rays`).
         jitter: False: no random numbers.
     """
 
@@ -80,16 +80,16 @@ class TileGradients:
         """Add a batch's gradients to the parameters'.
 
         Args:
-            batch: pixels, colors, weights.
-            key: of the step's random numbers.
-            share: what part of the step's batch this is; None: all of it.
+            batch: pixels, colors and weights.
+            key: key of the step's random numbers.
+            share: this part of the step's batch; None: all of it.
             backward: adds a loss's gradients to the parameters'.
 
         Returns:
-            What this share saw; its losses and errors add up over all shares to the batch's.
+            The output of this share; losses and errors of all shares add up to the batch's.
 
         Raises:
-            InputError: there is no memory for the smallest tiles.
+            InputError: memory does not suffice for the smallest tiles.
         """
         share = Share.whole(batch) if share is None else share
         with self.on_threads(batch.weight.device):
@@ -109,14 +109,14 @@ class TileGradients:
     def in_tiles_of(
         self, num_pixels: int, batch: Batch, share: Share, key: int | Tensor, backward: Backward = torch_backward
     ) -> StepOutput:
-        """Add a batch's gradients, in tiles of so many pixels; without a look at the memory."""
+        """Add a batch's gradients, in tiles of `num_pixels` pixels, without handling memory errors."""
         objective, device = self.objective, batch.weight.device
         random = batch_random(key, batch.num_rays, device, share.first) if self.jitter else None
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight_scale = share.num_rays / share.weight.clamp(min=1.0)
 
         def lose(tile: slice) -> StepOutput:
-            # Cameras that learn are asked in each tile, since its backward pass ends in them.
+            # Learned cameras are evaluated in each tile, since its backward pass ends in them.
             seen = objective(batch[tile], None if random is None else random[tile], weight_scale)
             return seen.scaled((tile.stop - tile.start) / share.num_rays)
 
@@ -133,11 +133,11 @@ class TileGradients:
 
     @property
     def picture_points(self) -> int:
-        """Most points that a tile of a picture, rendered beside the steps, may send through a field at once."""
+        """Maximum number of points that a picture's tile, rendered between steps, may send through a field at once."""
         return self.points or WHOLE_BATCH_POINTS
 
     def on_threads(self, device: torch.device) -> AbstractContextManager[None]:
-        """Return a context for steps: whole batches are for torch's threads, tiles are shared out here."""
+        """Return a context for steps: torch's threads process whole batches, our own process tiles."""
         return torch_on_one_thread() if self.points is not None and device.type == "cpu" else nullcontext()
 
     def _pixels_in_tile(self, batch: Batch) -> int:
@@ -160,7 +160,7 @@ class TileGradients:
 def sequential_backward(
     lose: Callable[[slice], StepOutput], tiles: Sequence[slice], backward: Backward
 ) -> list[StepOutput]:
-    """Send one tile after the other forward and backward, and return what they have lost, in order."""
+    """Send one tile after another forward and backward, and return their outputs in order."""
     losses = []
     for tile in tiles:
         lost = lose(tile)
@@ -172,9 +172,9 @@ def sequential_backward(
 def parallel_backward(
     lose: Callable[[slice], StepOutput], tiles: Sequence[slice], backward: Backward, parameters: Sequence[Parameter]
 ) -> list[StepOutput]:
-    """Do the same on as many threads as torch has; sums are taken in the order of the tiles, so their bits are fixed.
+    """Do the same on as many threads as torch has; sums are in the order of the tiles, so their bits are fixed.
 
-    `backward` is called once, with the loss of all tiles, and hands on the gradients that the threads have found.
+    `backward` is called once, with the loss of all tiles, and passes on the gradients that the threads have computed.
     """
     learnt = [parameter for parameter in parameters if parameter.requires_grad]
 

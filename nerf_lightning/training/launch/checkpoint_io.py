@@ -1,4 +1,4 @@
-"""Saving beside training: the training waits for a copy in memory, a thread of its own writes the file."""
+"""Saving in parallel with training: training waits for a copy in memory, and a separate thread writes the file."""
 
 import logging
 from collections import deque
@@ -13,17 +13,17 @@ from torch import Tensor
 from nerf_lightning.checkpoints.reading import content_to_resume
 from nerf_lightning.checkpoints.writing import write_checkpoint
 
-# Copies in memory: one being written, one that waits for it (`last` and `best` fall due at the same step).
+# Copies in memory: one being written, and one waiting (`last` and `best` may be due at the same step).
 MOST_COPIES = 2
 
 log = logging.getLogger(__name__)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Copy what is saved to the host's memory, and write it in the background, whole or not at all.
+    """Copy a checkpoint to the host's memory, and write it in the background, whole or not at all.
 
-    Lightning's AsyncCheckpointIO lets any number of copies wait, tells of a failure at the next save only, and puts
-    Lightning's own writer in the place of ours.
+    Lightning's AsyncCheckpointIO lets any number of copies wait, reports a failure only at the next save, and replaces
+    our writer with Lightning's own.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self.writes: deque[Future[None]] = deque()
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Take a copy and return; wait first where too many copies are not written yet.
+        """Take a copy and return; first wait if too many copies have not been written yet.
 
         Raises:
             InputError: an earlier write failed.
@@ -42,15 +42,15 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self.raise_failure()
         if self.writer is None:
             self.writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
-        # The optimizer changes its tensors in place, and callbacks their lists: nothing may be shared.
+        # The optimizer changes its tensors in place, and callbacks change their lists: nothing may be shared.
         copy = apply_to_collection(checkpoint, Tensor, _on_the_host)
         self.writes.append(self.writer.submit(write_checkpoint, copy, Path(path)))
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        """Return a checkpoint that training can go on from, on the host: the file may come from anybody.
+        """Return a checkpoint that training can resume from, on the host: the file is untrusted.
 
         Raises:
-            InputError: it cannot be read, or is not as `checkpoints.format` says.
+            InputError: it cannot be read, or does not follow `checkpoints.format`.
         """
         return content_to_resume(Path(path))
 
@@ -64,7 +64,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             self.writes.popleft().result()
 
     def wait(self) -> None:
-        """Return when everything is on the disk.
+        """Return when everything is on disk.
 
         Raises:
             InputError: a write has failed.
@@ -73,7 +73,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             self.writes.popleft().result()
 
     def teardown(self) -> None:
-        """Wait; the run may be ending with an error of its own, so failures are only told."""
+        """Wait; the run may be ending with its own error, so failures are only logged."""
         for write in self.writes:
             error = write.exception()
             if error is not None:

@@ -1,4 +1,4 @@
-"""What a system takes from the trainer that fits it, ours or Lightning's own: the run's length; and what it refuses."""
+"""What a system takes from the trainer that fits it, ours or Lightning's (the run's length), and what it refuses."""
 
 import logging
 import math
@@ -30,18 +30,18 @@ log = logging.getLogger(__name__)
 
 
 def length_of_run(trainer: Trainer, progress: Progress) -> int:
-    """Return the steps from the first to the last: `max_steps`, or as many as the epochs have, whichever ends first.
+    """Return the number of steps of the run: `max_steps`, or those of the epochs, whichever ends first.
 
     Args:
-        trainer: about to fit.
-        progress: of the system.
+        trainer: the trainer that is about to fit.
+        progress: the system's progress.
 
     Raises:
-        InputError: the run has no end, begins where no run begins, or the trainer would compute something else.
+        InputError: the run has no end, does not begin at the start, or the trainer would compute something else.
     """
     _require_beginning(trainer, progress)
     _warn_of_timer(trainer)
-    trainer.fit_loop.setup_data()  # the number below would ask for it, and say so in the log
+    trainer.fit_loop.setup_data()  # the property below would do this, with a log message
     steps = trainer.estimated_stepping_batches
     if math.isinf(steps):
         raise InputError(
@@ -51,7 +51,7 @@ def length_of_run(trainer: Trainer, progress: Progress) -> int:
 
 
 def _require_beginning(trainer: Trainer, progress: Progress) -> None:
-    """Refuse to begin in the midst of a run, or with the rays of another."""
+    """Refuse to begin in the middle of a run, or with the rays of another."""
     data = trainer.datamodule  # type: ignore[attr-defined]
     if isinstance(data, RayDataModule) and data.batches.progress is not progress:
         raise InputError(
@@ -67,10 +67,10 @@ def _require_beginning(trainer: Trainer, progress: Progress) -> None:
 
 
 def require_fitting(trainer: Trainer) -> None:
-    """Refuse a trainer that would do to a step what the step does by itself, or what no step follows.
+    """Refuse a trainer that would repeat what a step does by itself, or that requests what steps do not support.
 
     Raises:
-        InputError: with what to set instead.
+        InputError: says what to set instead.
     """
     require_one_process(trainer.lightning_module.train_step, trainer.world_size)  # type: ignore[arg-type]
     reasons = [*_of_settings(trainer), *_of_devices(trainer), *_of_callbacks(trainer)]
@@ -81,10 +81,10 @@ def require_fitting(trainer: Trainer) -> None:
 
 
 def require_one_process(train_step: TrainStep, world_size: int) -> None:
-    """Refuse several processes where a part looks at all rays of a step.
+    """Refuse several processes if a part depends on all rays of a step.
 
     Raises:
-        InputError: with its class.
+        InputError: names its class.
     """
     coupled = coupled_parts(train_step.objective)
     if coupled and world_size > 1:
@@ -152,14 +152,14 @@ def _has(trainer: Trainer, kind: type) -> bool:
 
 
 def require_deterministic(module: nn.Module, device_type: str) -> None:
-    """Refuse to promise the same bits in each run where sums are taken in any order.
+    """Refuse to promise bit-reproducible runs if sums are taken in arbitrary order.
 
     Args:
-        module: what is trained.
-        device_type: where.
+        module: the module that is trained.
+        device_type: the device's type.
 
     Raises:
-        InputError: it has hash grids, and trains on a GPU of NVIDIA's.
+        InputError: it has hash grids, and trains on an NVIDIA GPU.
     """
     if device_type == "cuda" and any(isinstance(part, HashGridEncoder) for part in module.modules()):
         raise InputError(
@@ -170,7 +170,7 @@ def require_deterministic(module: nn.Module, device_type: str) -> None:
 
 
 def _warn_of_timer(trainer: Trainer) -> None:
-    """Say that a run that is ended by Lightning's clock may end with a high learning rate."""
+    """Warn that a run ended by Lightning's timer may end with a high learning rate."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]
     ends = any(isinstance(each, Timer) and each.time_remaining() is not None for each in callbacks)
     if ends and not _has(trainer, TimeBudget):

@@ -1,6 +1,6 @@
-"""Arguments of Lightning's Trainer that pass through (`trainer.lightning`), and those that settings of ours say.
+"""Arguments of Lightning's Trainer that pass through (`trainer.lightning`), and those that our settings control.
 
-None that passes through changes what is learned: they say what is measured, shown or tried out. So a run of other flags
+None that pass through change what is learned: they control what is measured, shown or tried. So a run with other flags
 is the same run.
 """
 
@@ -23,21 +23,21 @@ from nerf_lightning.config.lightning_arguments import OWNED
 from nerf_lightning.messages.errors import InputError
 
 DEFAULTS: dict[str, Any] = {"num_sanity_val_steps": 0, "enable_model_summary": False, "log_every_n_steps": 1}
-"""Ours, where they differ from Lightning's."""
+"""Our defaults, where they differ from Lightning's."""
 REFUSALS = (MisconfigurationException, ValueError, TypeError, ImportError)
-"""What Lightning raises for an argument that it does not take."""
+"""What Lightning raises for an argument that it does not accept."""
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 PROFILE = "profile"
 
 
 def passed_through(flags: object) -> dict[str, Any]:
-    """Return the arguments that Lightning's Trainer gets beside ours.
+    """Return the arguments that Lightning's Trainer gets besides ours.
 
     Args:
         flags: as given under `trainer.lightning`.
 
     Raises:
-        InputError: one that is unknown, or ours to say, or of a value that Lightning does not take.
+        InputError: one is unknown, or controlled by our settings, or has a value that Lightning does not accept.
     """
     if not flags:
         return DEFAULTS
@@ -58,7 +58,7 @@ def passed_through(flags: object) -> dict[str, Any]:
     given = DEFAULTS | flags
     try:
         with _silence():
-            # Tried here, since a run folder is taken before the Trainer is made.
+            # Tried here, since the run folder is created before the Trainer.
             Trainer(
                 accelerator="cpu", devices=1, plugins=[LightningEnvironment()], logger=False, max_steps=1,
                 enable_checkpointing=False, enable_progress_bar=False, **given,
@@ -71,11 +71,11 @@ def passed_through(flags: object) -> dict[str, Any]:
 
 
 def written_to(folder: Path, flags: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with a profiler that writes its table, which is wider than a terminal, to a file.
+    """Return the arguments, with a profiler that writes its table, which is wider than a terminal, to a file.
 
     Args:
-        folder: of the run; the table is in `fit-profile.txt`.
-        flags: from `passed_through`.
+        folder: the run folder; the table is in `fit-profile.txt`.
+        flags: the result of `passed_through`.
     """
     kind = flags.get("profiler")
     if not isinstance(kind, str) or kind not in PROFILERS:

@@ -1,11 +1,11 @@
-"""Being asked by a scheduler to leave: stop where nothing is lost, and see that the job is started again.
+"""Preemption by a scheduler: stop without losing anything, and have the job started again.
 
-While training, `callbacks/stop_signals.py` finishes the step and saves; before and after it there is nothing to save,
-and the process leaves at once. Either way it ends with SystemExit(128 + signal), and here is done what follows from it:
+During training, `callbacks/stop_signals.py` finishes the step and saves; before and after it there is nothing to save,
+and the process exits at once. Either way it ends with SystemExit(128 + signal), and this module does the rest:
 
-* SIGUSR1 in a Slurm job (sbatch --signal=USR1@90): the job is put back into the queue.
+* SIGUSR1 in a Slurm job (sbatch --signal=USR1@90): the job is requeued.
 * The signal of submitit (SIGUSR2 if not configured): submitit's own handler is called, which counts and requeues.
-* SIGTERM: nothing. Slurm itself requeues what it preempts, and what a person cancels shall stay canceled.
+* SIGTERM: nothing. Slurm itself requeues what it preempts, and what the user cancels must stay canceled.
 """
 
 import os
@@ -22,8 +22,8 @@ from nerf_lightning.compute.slurm import requeue
 
 @contextmanager
 def preemptible() -> Iterator[None]:
-    """Leave at a scheduler's signal, and requeue if it wants that."""
-    if distributed.is_initialized():  # a worker: the process that started it hears the scheduler
+    """Exit at a scheduler's signal, and requeue if the signal means that."""
+    if distributed.is_initialized():  # a worker: the process that started it handles the signals
         yield
         return
     listened = [number for number in stop_signals() if number != signal.SIGINT]
@@ -40,7 +40,7 @@ def preemptible() -> Iterator[None]:
 
 
 def wants_restart(code: Any) -> bool:
-    """Return whether an exit code is that of a signal whose sender will start the run again."""
+    """Return whether an exit code is of a signal after which the run is started again."""
     sent = {submitit_signal()} | ({signal.SIGUSR1} if hasattr(signal, "SIGUSR1") else set())
     return isinstance(code, int) and code - 128 in sent
 
@@ -58,7 +58,7 @@ def _restart(number: int, former: dict[int, Any]) -> None:
 
 
 def stop_signals() -> list[int]:
-    """Return the signals that ask a run to save and stop."""
+    """Return the signals that make a run save and stop."""
     names = [name for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
     numbers = [int(getattr(signal, name)) for name in names]
     own = submitit_signal()
@@ -66,7 +66,7 @@ def stop_signals() -> list[int]:
 
 
 def submitit_signal() -> int | None:
-    """Return the signal by which submitit tells its job that the time is up, or None outside of submitit."""
+    """Return the signal with which submitit ends its job when the time is up; None outside submitit."""
     if "SUBMITIT_EXECUTOR" not in os.environ:
         return None
     found = getattr(signal, "SIG" + os.environ.get("SUBMITIT_PREEMPT_SIGNAL", "USR2"), None)

@@ -1,7 +1,7 @@
-"""The processes of one run: started here (one per device), or by torchrun or srun, and joined.
+"""Start the processes of one run (one per device), or join those started by torchrun or srun.
 
-Lightning would start the others by repeating the command line, which starts sweeps anew. Here torch's own launcher
-starts `python -m nerf_lightning.cli.worker` on the config that this process has composed.
+Lightning would start the others by repeating the command line, which would restart sweeps. Here torch's own launcher
+starts `python -m nerf_lightning.cli.worker` with the config that this process has composed.
 """
 
 import logging
@@ -33,24 +33,24 @@ from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError
 
-# What of Hydra's own config a worker may ask for.
+# The parts of Hydra's own config that a worker may need.
 HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_logging"]
 MOST_PROCESSES = 1024
-"""Of one machine; each takes half a gigabyte and more."""
+"""Maximum number per machine; each takes half a gigabyte or more."""
 LONGEST_WAIT = timedelta(hours=2)
-# So long another process may take to say what is wrong, before this one says it too.
+# Time for another process to report an error before this one does.
 PATIENCE_SECONDS = 3.0
 WATCH_SECONDS = 1.0
 
 
 def on_all_processes(command: str, config: DictConfig, work: Callable[[DictConfig], Any]) -> Any:
-    """Do a command's work in as many processes as the config's trainer wants, and return the first one's result.
+    """Do a command's work in as many processes as the config's trainer requests, and return the first one's result.
 
     Raises:
-        InputError: the processes that the config speaks of were not started, or others were.
+        InputError: the processes that the config requests were not started, or others were.
         SystemExit: a process ended with this code.
     """
-    if distributed.is_initialized():  # a worker: its processes are joined
+    if distributed.is_initialized():  # a worker: its processes are already joined
         return work(config)
     require_fitting_values(config.trainer, "trainer")
     launcher: Launcher = config.trainer.launched_by
@@ -69,7 +69,7 @@ def num_processes(devices: int | str, device_type: str) -> int:
         InputError: there are fewer devices, or their number is left open on the CPU.
     """
     if device_type == "xla":
-        return 1  # which drives all cores
+        return 1  # one process drives all cores
     there = torch.cuda.device_count() if device_type == "cuda" else 1
     if devices == "auto" and device_type == "cpu":
         raise InputError(
@@ -85,10 +85,10 @@ def num_processes(devices: int | str, device_type: str) -> int:
 
 
 def require_one_task() -> None:
-    """Refuse to train alone in a Slurm job of several tasks: Lightning takes the process for one of them.
+    """Refuse to train in one process in a Slurm job of several tasks: Lightning would take it for one of them.
 
     Raises:
-        InputError: with how many there are.
+        InputError: says how many there are.
     """
     tasks = num_tasks()
     if tasks > 1 and not distributed.is_initialized() and SLURMEnvironment.detect():
@@ -101,7 +101,7 @@ def require_one_task() -> None:
 
 @contextmanager
 def joined(device_type: str) -> Iterator[None]:
-    """Join the processes that torchrun or srun has started; only the first one speaks."""
+    """Join the processes that torchrun or srun has started; only the first one prints and logs."""
     environment = cluster_environment()
     os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"] = environment.main_address, str(environment.main_port)
     if device_type == "cuda":
@@ -119,7 +119,8 @@ def joined(device_type: str) -> Iterator[None]:
         yield
     except InputError:
         if not ranks.is_first():
-            # The first process reports the same error and ends the others; one that fails alone does so after this.
+            # Usually the first process reports the same error and ends the others; otherwise this one does after a
+            # while.
             time.sleep(PATIENCE_SECONDS)
         raise
     finally:
@@ -130,14 +131,14 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
     """Start `count` workers on this machine and wait for them; return what the first one returned.
 
     Raises:
-        SystemExit: a worker failed or was stopped by a signal; what is wrong it has said.
+        SystemExit: a worker failed or was stopped by a signal; it has reported why.
     """
     from torch.distributed.elastic.multiprocessing import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     for name in ("torch.distributed.elastic", "torch.distributed.launcher"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # it repeats what the workers have said
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # it repeats the workers' errors
     with tempfile.TemporaryDirectory(prefix="nerf-") as folder, _share_of_cores(count):
         OmegaConf.save(config, Path(folder) / "config.yaml")
         hydra: Any = HydraConfig.get()
@@ -165,14 +166,14 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
 
 
 def end_with(launcher: int) -> None:
-    """Let a worker end soon after its launcher, which cannot stop it any more where it was killed itself."""
+    """Make a worker end soon after its launcher, which cannot stop it if killed itself."""
 
     def watch() -> None:
         while os.getppid() == launcher:
             time.sleep(WATCH_SECONDS)
         os._exit(128 + signal.SIGTERM)
 
-    if os.name == "posix":  # elsewhere the number of a parent says nothing
+    if os.name == "posix":  # elsewhere a parent's process ID says nothing
         threading.Thread(target=watch, daemon=True).start()
 
 

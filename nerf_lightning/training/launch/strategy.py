@@ -5,9 +5,9 @@ from torch.nn import Module
 
 
 class OneSumPerStep(DDPStrategy):
-    """Leave the module unwrapped: the system adds the gradients up once a step, after its last tile.
+    """Leave the module unwrapped: the system sums the gradients once per step, after the last tile.
 
-    DDP's wrapper would do so in each tile's backward, and wants every parameter to have had a gradient there.
+    DDP's wrapper would do so in each tile's backward pass, and requires every parameter to get a gradient there.
     """
 
     def _setup_model(self, model: Module) -> Module:  # type: ignore[override]

@@ -1,4 +1,4 @@
-"""How and for how long to train, and Lightning's Trainer made from it."""
+"""Settings of how and how long to train, and the Lightning Trainer built from them."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ MOST_EPOCHS = MOST_STEPS = 1 << 31
 
 
 class TrainerSettings(ComputeSettings):
-    """How and for how long to train.
+    """How and how long to train.
 
     Args:
         max_steps: total number of training steps; None: no limit but max_epochs and budget.seconds.
@@ -104,7 +104,7 @@ class TrainerSettings(ComputeSettings):
     def records(self, train_step: TrainStep) -> bool:
         """Return whether to record a run's steps.
 
-        auto: not compiled ones, or those of parts of one's own that do not say whether they can be replayed.
+        auto: unless they are compiled, or parts of your own do not say whether they can be replayed.
         """
         if self.cuda_graph != "auto":
             return self.cuda_graph
@@ -112,11 +112,11 @@ class TrainerSettings(ComputeSettings):
         return tried and not not_replayed(train_step.objective, only_known=True)
 
     def records_there(self, train_step: TrainStep) -> bool:
-        """Return whether to record a run's steps where its weights are: one's own Trainer may have moved them."""
+        """Return whether to record a run's steps on its weights' device: another Trainer may have moved them."""
         return train_step.device.type == self.device_type and self.records(train_step)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
-        """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
+        """Return the length of the run in steps, for a training split of `num_rays` rays; epochs exclude the crop."""
         most = int(self.lightning.get("fast_dev_run", False)) or MOST_STEPS
         most = min(most, self.max_steps or MOST_STEPS)
         if self.max_epochs is None:
@@ -124,7 +124,7 @@ class TrainerSettings(ComputeSettings):
         return min(most, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
 
     def build(self, folder: Path, num_steps: int, callbacks: Sequence[Callback], loggers: Sequence[Logger]) -> Trainer:
-        """Return Lightning's Trainer for this process's device, one of several where processes are joined."""
+        """Return Lightning's Trainer for this process's device, one of several if processes are joined."""
         return Trainer(
             default_root_dir=folder,
             max_steps=num_steps,
@@ -144,13 +144,13 @@ class TrainerSettings(ComputeSettings):
         if self.device_type == "xla":
             return xla.trainer_arguments(int(self.devices))
         several = distributed.is_initialized()
-        # Else Lightning would find Slurm by itself, save in the midst of a step and requeue.
+        # Else Lightning would detect Slurm by itself, save in the middle of a step and requeue.
         environment = [cluster_environment()] if several or SLURMEnvironment.detect() else []
         return {
             "accelerator": LIGHTNING_NAMES[self.device_type],
             "devices": processes_here() if several else 1,
             "num_nodes": distributed.get_world_size() // processes_here() if several else 1,
             "strategy": OneSumPerStep() if several else "auto",
-            "precision": "32-true",  # Lightning's would lower whatever stands in a step; fields know their own
+            "precision": "32-true",  # Lightning's would lower everything in a step; fields know their own
             "plugins": [AtomicCheckpointIO(), *environment],
         }

@@ -1,7 +1,7 @@
-"""XLA devices (TPUs) under Lightning: one process, whatever the number of cores, and the parts that differ there.
+"""XLA devices (TPUs) under Lightning: one process for any number of cores, and the parts that differ there.
 
-The cores run one program: rays are spread over them, weights are copied to each, and the compiler adds up the
-gradients (SPMD, single program, multiple data). So nothing else has to know how many there are.
+The cores run one program: rays are sharded, weights are replicated, and the compiler sums the gradients (SPMD, single
+program, multiple data). So nothing else depends on the number of cores.
 """
 
 from typing import Any
@@ -18,10 +18,10 @@ from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
 
 def refuse(compiles: bool, launched_by: str) -> None:
-    """Refuse settings that mean nothing to XLA.
+    """Refuse settings that do not apply to XLA.
 
     Raises:
-        InputError: there are some.
+        InputError: there are such settings.
     """
     if compiles:
         raise InputError("trainer.compile=true is for other devices: XLA compiles every step by itself. Leave it out.")
@@ -32,10 +32,10 @@ def refuse(compiles: bool, launched_by: str) -> None:
 
 
 def require_static_shapes(model: Model) -> None:
-    """Refuse models that XLA would compile anew at each step.
+    """Refuse models that XLA would recompile at each step.
 
     Raises:
-        InputError: shapes of this one depend on the data.
+        InputError: the model's shapes depend on the data.
     """
     if not model.has_static_shapes:
         raise InputError(
@@ -45,7 +45,7 @@ def require_static_shapes(model: Model) -> None:
 
 
 def trainer_arguments(cores: int) -> dict[str, Any]:
-    """Return what Lightning's Trainer has to know."""
+    """Return the arguments of Lightning's Trainer."""
     return {"accelerator": xla_device.ACCELERATOR(), "devices": 1, "strategy": ManyCores(cores)}
 
 
@@ -57,7 +57,7 @@ class ManyCores(SingleDeviceXLAStrategy):
         self.cores = cores
 
     def batch_to_device(self, batch: Any, device: torch.device | None = None, dataloader_idx: int = 0) -> Any:
-        """Put a batch onto the cores, each a share of the rays."""
+        """Move a batch to the cores, each with a share of the rays."""
         batch = super().batch_to_device(batch, device, dataloader_idx)
         return batch if self.cores == 1 else batch.map(self._spread)
 
@@ -71,4 +71,4 @@ class ManyCores(SingleDeviceXLAStrategy):
 
 
 class AtomicXLACheckpointIO(AtomicCheckpointIO, XLACheckpointIO):
-    """Write as elsewhere; Lightning asks for the other kind by name."""
+    """Write as elsewhere; Lightning requires the XLA class."""

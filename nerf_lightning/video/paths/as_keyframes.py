@@ -1,4 +1,4 @@
-"""Any camera path as keyframes: for a player that knows no other kind, and for a person to change by hand."""
+"""Any camera path as keyframes, for a player that supports no other kind, and for the user to edit by hand."""
 
 import math
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, Point
 
 MOST = 24
-"""Keyframes that stand for a path which has none of its own: on a circle, the curve through them is one to 1e-4."""
-NEAREST_TARGET = 0.1  # What a camera looks at is ahead of it by this share of the scene's radius at least.
-CLOSED = 1.5  # A path whose last camera is so near its first one, in steps of its first frame, goes on in a circle.
+"""Number of keyframes for a path that has none of its own: for a circle, their curve is one to within 1e-4."""
+NEAREST_TARGET = 0.1  # Minimum distance of what a camera looks at, as a share of the scene's radius.
+CLOSED = 1.5  # A path is closed if its last camera is this near its first one, in steps of its first frame.
 
 
 def as_keyframes(path: CameraPath, around: PathFrame) -> list[Keyframe]:
-    """Return keyframes, each with all that a camera needs, whose curve follows a path; of one camera, none."""
+    """Return complete keyframes whose curve follows a path; none for a single camera."""
     if isinstance(path, KeyframePath):
         return _of_file(path, around) if path.times or path.seconds else []
     cameras = path.cameras(around)
@@ -35,7 +35,7 @@ def as_keyframes(path: CameraPath, around: PathFrame) -> list[Keyframe]:
 
 
 def _of_file(path: KeyframePath, around: PathFrame) -> list[Keyframe]:
-    """Return the keyframes that it has."""
+    """Return the path's own keyframes."""
     curve = KeyframeCurve(path.keyframes, around, path.times, path.closed)
     times = curve.knots if path.times else curve.knots * path.seconds
     focal = curve.focal(curve.knots)

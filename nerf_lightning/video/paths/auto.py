@@ -1,4 +1,4 @@
-"""The path that suits a capture: around what its photographs look at, in front of it, or past the photographs."""
+"""The path that suits a capture: around what its photographs show, in front of it, or past the photographs."""
 
 from dataclasses import dataclass
 from typing import final
@@ -13,14 +13,14 @@ from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.paths.sweep import Sweep
 from nerf_lightning.video.paths.walk import Walk
 
-FACING = 0.7  # Least cosine between where most photographs look and the center.
-BEYOND = 0.05  # Of the photographs, how many may have the center behind them.
+FACING = 0.7  # Minimum cosine between most photographs' directions and that to the center
+BEYOND = 0.05  # Share of the photographs that may have the center behind them
 
 
 @final
 @dataclass
 class AutoPath(CameraPath):
-    """A sweep around what the photographs look at, a spiral in front of what faces them, or a walk past them.
+    """A sweep around what the photographs show, a spiral in front of what faces them, or a walk past them.
 
     Args:
         longest: without width and height, the maximum length of the longer side, in pixels; otherwise images are as
@@ -36,7 +36,7 @@ class AutoPath(CameraPath):
 
     @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
-        """Return the cameras of the path that was chosen."""
+        """Return the cameras of the chosen path."""
         width = self.width
         if width is None and self.height is None:
             width = max(1, round(around.width * min(1.0, self.longest / max(around.width, around.height))))
@@ -48,7 +48,7 @@ class AutoPath(CameraPath):
 def looks_at_center(around: PathFrame) -> bool:
     """Return whether most photographs show the center, seen from different sides; forward-facing captures have none.
 
-    Nor has a walk along a street, where some photographs were taken beyond what the others look at.
+    Neither does a walk along a street, where some photographs were taken beyond what the others show.
     """
     if around.forward_facing:
         return False
@@ -59,7 +59,7 @@ def looks_at_center(around: PathFrame) -> bool:
 
 @disable_autocast
 def faces_one_way(around: PathFrame) -> bool:
-    """Return whether the photographs were taken side by side, looking the same way, and not one ahead of the other."""
+    """Return whether the photographs were taken side by side, in the same direction, and not one ahead of another."""
     if around.forward_facing:
         return True
     mean = average_pose(around.poses)

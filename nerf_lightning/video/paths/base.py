@@ -1,7 +1,7 @@
-"""The contract of a camera path: a frame of reference in, cameras in order of time out.
+"""The contract of a camera path: a frame of reference in, cameras in temporal order out.
 
-What a person gives or reads (positions, distances, directions) is in the frame and the units of the capture's own
-files; `PathFrame.to_user` says how the working frame lies in it.
+The user's input and output (positions, distances, directions) is in the frame and the units of the capture's own files;
+`PathFrame.to_user` maps the working frame to it.
 """
 
 import math
@@ -22,7 +22,7 @@ from nerf_lightning.nerf.geometry.world_frame import points_from_user, unit_of
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 
-NDC_FOCUS = 5.0  # What a camera in front of a scene looks at, in units of the near plane's distance.
+NDC_FOCUS = 5.0  # Distance of the point that a camera in front of a scene looks at, in units of the near plane's.
 LARGEST = 1e15  # Larger numbers overflow when they are squared.
 
 Content = Callable[[], Float[Tensor, "points 3"]]
@@ -30,30 +30,30 @@ Content = Callable[[], Float[Tensor, "points 3"]]
 
 @dataclass(frozen=True)
 class PathFrame:
-    """What a path moves around, and through what kind of camera it looks."""
+    """What a path moves around, and its kind of camera."""
 
     center: Float[Tensor, "3"]
     """The point to look at, in scene coordinates."""
     up: Float[Tensor, "3"]
-    """Where the top of the picture points; any length but zero."""
+    """Direction of the picture's top; any nonzero length."""
     radius: float
-    """How far the photographs were taken from the center, in scene units."""
+    """Distance of the photographs from the center, in scene units."""
     focal: float
     """Focal length in pixels, for a picture of `width` by `height`."""
     width: int
     height: int
     poses: Float[Tensor, "views 3 4"]
-    """Where the photographs were taken, camera to world."""
+    """Poses of the photographs, camera to world."""
     to_user: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
-    """Similarity that takes scene coordinates to the capture's own frame."""
+    """Similarity from scene coordinates to the capture's own frame."""
     view_names: tuple[str, ...] = ()
-    """What the photographs are called, in the order of `poses`."""
+    """Names of the photographs, in the order of `poses`."""
     forward_facing: bool = False
     """Whether all photographs look the same way, into normalized device coordinates."""
     bounded: bool = False
-    """Whether nothing lies behind the content, so that it may be looked at from any distance."""
+    """Whether nothing is behind the content, so that it may be viewed from any distance."""
     content: Content = lambda: torch.zeros(0, 3)
-    """Returns points of what the photographs show in their middle; none where no model is known."""
+    """Returns points of what the photographs show in their middle; none if no model is known."""
 
     @property
     def unit(self) -> float:
@@ -77,9 +77,9 @@ class PathFrame:
         return normalize(self.to_user[:3, :3].double().mT @ user, dim=0).to(self.center)
 
     def size(self, width: int | None, height: int | None) -> tuple[int, int, float]:
-        """Return a picture's width, height, and how much longer its focal length is in pixels.
+        """Return a picture's width, height, and the factor on its focal length in pixels.
 
-        A side that is None follows the other; where both are, they are the frame's own.
+        A side that is None follows the other; if both are, they are the frame's own.
         """
         if width is None and height is not None:
             scale = height / self.height
@@ -90,7 +90,7 @@ class PathFrame:
 
 
 def is_point(given: object) -> bool:
-    """Return whether something is three finite numbers.
+    """Return whether a value is three finite numbers.
 
     >>> is_point([0, 1.5, -2]), is_point([0, 1]), is_point("top")
     (True, False, False)
@@ -99,27 +99,27 @@ def is_point(given: object) -> bool:
 
 
 def is_number(given: object) -> bool:
-    """Return whether something is a number that a path can have: finite, and not astronomical."""
+    """Return whether a value is a number that a path can have: finite, and not astronomical."""
     return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) < LARGEST
 
 
 def check_setting(name: str, value: object, good: bool, rule: str) -> None:
-    """Refuse a setting of a path that is not good."""
+    """Refuse an invalid setting of a path."""
     if not good:
         raise InputError(f"path.{name} is {value}, but must be {rule}")
 
 
 def check_turns(turns: float, start: float = 0.0) -> None:
-    """Refuse a number of circles, or the angle in degrees at which they begin, that is not good."""
+    """Refuse an invalid number of circles, or an invalid angle in degrees at which they begin."""
     check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
     check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
 
 
 @disable_autocast
 def level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the unit vectors up, where azimuth 0 lies, and where 90 degrees do.
+    """Return the unit vectors up, of azimuth 0, and of azimuth 90 degrees.
 
-    Azimuth 0 is the x axis brought to the horizon, or the y axis where x is nearly up.
+    Azimuth 0 is the x axis projected to the horizon, or the y axis if x is nearly up.
     """
     up = normalize(up, dim=0)
     axis = torch.zeros_like(up)
@@ -130,7 +130,7 @@ def level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor
 
 @dataclass
 class CameraPath(ABC):
-    """A path of virtual cameras for a video; a subclass adds the settings of its own.
+    """A path of virtual cameras for a video; subclasses add their own settings.
 
     Args:
         num_frames: number of cameras.
@@ -160,7 +160,7 @@ class CameraPath(ABC):
 
     @abstractmethod
     def cameras(self, around: PathFrame) -> Cameras:
-        """Return one camera per frame, all of one size, in order of time."""
+        """Return one camera per frame, all of one size, in temporal order."""
 
     def pinholes(self, c2w: Float[Tensor, "frames 3 4"], around: PathFrame) -> Cameras:
         """Return cameras at these poses. A picture of another size keeps the horizontal field of view."""
@@ -184,17 +184,16 @@ def frame_of(
 ) -> PathFrame:
     """Return the frame of a capture: the middle of its box, seen from the mean distance of its cameras.
 
-    Forward-facing captures have no middle: theirs lies in front of the mean camera, a few times as far as the near
-    plane, and up is the mean camera's.
+    Forward-facing captures have no middle: theirs is in front of the mean camera, a few times as far as the near plane,
+    and up is the mean camera's.
 
-    Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal
-    point are left behind, for what is rendered on a path is seen through a centered pinhole. The default `up` is the
-    world's z axis.
+    Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal point
+    are ignored, since paths are rendered through a centered pinhole. The default `up` is the world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)
     if cameras.ndc is not None:
         center, up = torch.tensor([0.0, 0.0, -NDC_FOCUS]).to(cameras.c2w), (0.0, 1.0, 0.0)
-    # Of panoramas a film shows what a person would look at: 90 degrees across.
+    # For panoramas a film shows a natural field of view: 90 degrees across.
     panoramas = cameras.lens_model == "equirectangular"
     return PathFrame(
         center=center,

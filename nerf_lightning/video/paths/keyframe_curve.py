@@ -1,4 +1,4 @@
-"""The smooth curve through keyframes: where a camera stands at any time, and how much it sees."""
+"""The smooth curve through keyframes: a camera's pose and field of view at any time."""
 
 import math
 from collections.abc import Sequence
@@ -15,22 +15,22 @@ from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.video.paths.spline import along, even_speed, poses_along
 
-LEAST_SINE = 1e-6  # Of the angle between where a keyframe looks and its up: less is rounding.
+LEAST_SINE = 1e-6  # Of the angle between a keyframe's direction and its up: less is rounding.
 
 
 class KeyframeCurve:
-    """Pass through keyframes (`video.paths.spline`), as `KeyframePath` says.
+    """A curve through keyframes (`video.paths.spline`), as `KeyframePath` describes.
 
     Args:
         keyframes: two or more.
         around: the capture.
-        times: when each is passed, and for a closed curve when the first one is again (seconds); empty: at about one
-            speed, from 0 to 1.
-        closed: go back to the first keyframe.
+        times: when each is passed, and for a closed curve when the first one is passed again (seconds); empty: at about
+            constant speed, from 0 to 1.
+        closed: return to the first keyframe.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], around: PathFrame, times: Sequence[float], closed: bool = False):
-        # Times may lie close together for a long path.
+        # Times may be close together for a long path.
         self._keys = keyframe_poses(keyframes, around).double()
         even = even_speed(self._keys, around.radius, closed)
         self.knots = torch.tensor(times, dtype=self._keys.dtype) if times else even
@@ -39,7 +39,7 @@ class KeyframeCurve:
         self._log_focal = torch.tensor(logs, dtype=self.knots.dtype)
 
     def poses(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames 3 4"]:
-        """Return the cameras to world at some times."""
+        """Return the camera-to-world poses at some times."""
         c2w = poses_along(self.knots, self._keys, at)
         eyes = c2w[:, :, 3]
         back = normalize(eyes - along(self.knots, self._targets, at), dim=-1)
@@ -47,7 +47,7 @@ class KeyframeCurve:
         return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
 
     def focal(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
-        """Return the focal lengths at times (pixels, of the photographs' width), even in ratio between keyframes."""
+        """Return the focal lengths at some times (pixels, at the photographs' width), geometric between keyframes."""
         focal = along(self.knots, self._log_focal, at).exp()[:, 0].float()
         if not bool(((focal > 0) & torch.isfinite(focal)).all()):
             raise InputError(
@@ -58,7 +58,7 @@ class KeyframeCurve:
 
 
 def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "keys 3 4"]:
-    """Return the cameras to world of keyframes, none of which may look straight along its up."""
+    """Return the camera-to-world poses of keyframes, none of which may look along its up."""
     poses = [torch.zeros(0, 3, 4).to(around.center)]
     for number, each in enumerate(keyframes, start=1):
         eye = around.point("file", each.position)
@@ -73,5 +73,5 @@ def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Te
 
 
 def keyframe_focal(keyframe: Keyframe, around: PathFrame) -> float:
-    """Return a keyframe's focal length in pixels of a picture as wide as the photographs."""
+    """Return a keyframe's focal length in pixels, for a picture as wide as the photographs."""
     return around.focal if keyframe.fov is None else focal_from_fov(around.width, math.radians(keyframe.fov))

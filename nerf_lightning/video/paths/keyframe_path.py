@@ -18,10 +18,10 @@ FRAMES_WITHOUT_TIMES = 120
 
 @final
 class KeyframePath(CameraPath):
-    """Go through the keyframes of a file (`video.paths.keyframes`) on a smooth curve.
+    """Follow a smooth curve through the keyframes of a file (`video.paths.keyframes`).
 
-    Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
-    stays in the middle.
+    If all of them have a look_at, the point that the camera looks at moves on such a curve, too, so a point that they
+    share stays in the middle.
 
     Args:
         file: the keyframe file.
@@ -67,7 +67,7 @@ class KeyframePath(CameraPath):
 
     @property
     def seconds(self) -> float:
-        """How long it takes from the first camera to the last, or back to the first."""
+        """The time from the first camera to the last, or back to the first."""
         return (self._count() - (not self.closed)) / self.fps
 
     def _count(self) -> int:
@@ -79,7 +79,7 @@ class KeyframePath(CameraPath):
 
 
 def _times(keyframes: Sequence[Keyframe], closed: bool) -> list[float]:
-    """Return when each keyframe is passed, and at the end when the first one is again, in seconds from the first."""
+    """Return when each keyframe is passed, and last when the first one is passed again, in seconds from the first."""
     given = [each.time for each in keyframes if each.time is not None]
     times = [time - given[0] for time in given]
     return [*times, times[-1] + times[-1] / (len(times) - 1)] if closed and times else times

@@ -1,4 +1,4 @@
-"""Keyframe files: cameras that a person has chosen, as yaml that can be written by hand, read and written here.
+"""Read and write keyframe files: cameras chosen by the user, as yaml that can be written by hand.
 
 keyframes:
 - position: [4.0, 0.0, 2.0]   # in the frame and the units of the capture's own files
@@ -32,7 +32,7 @@ CURE = "Check path.file; a keyframe file is a plain list of cameras, without ref
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One chosen camera, as the file has it (above)."""
+    """One chosen camera, as in the file (above)."""
 
     position: Point
     look_at: Point
@@ -42,13 +42,13 @@ class Keyframe:
 
     @property
     def ahead(self) -> Point:
-        """Where it looks, of any length."""
+        """The direction in which it looks, of any length."""
         x, y, z = (to - at for to, at in zip(self.look_at, self.position, strict=True))
         return x, y, z
 
 
 def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
-    """Write a keyframe file, whole or not at all; what is None is left out."""
+    """Write a keyframe file, whole or not at all; None values are left out."""
     listed = [
         {key: list(value) if key in POINTS else value for key, value in asdict(each).items() if value is not None}
         for each in keyframes
@@ -61,7 +61,7 @@ def read_keyframes(path: Path) -> list[Keyframe]:
     """Read a keyframe file of two keyframes or more."""
     try:
         keyframes = _keyframes(read_plain_yaml(path, CURE), path)
-    except ValueError as error:  # Python writes down no whole number of thousands of digits
+    except ValueError as error:  # Python refuses to print integers of thousands of digits
         raise InputError(f"{path} holds a number that cannot be read ({error}). {CURE}") from error
     if len(keyframes) < 2:
         raise InputError(

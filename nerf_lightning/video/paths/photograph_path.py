@@ -15,7 +15,7 @@ from nerf_lightning.video.paths.spline import even_speed, frame_times, poses_alo
 @final
 @dataclass
 class PhotographPath(CameraPath):
-    """Go from photograph to photograph, where and as they were taken, at about one speed.
+    """Go from photograph to photograph, with their poses, at about constant speed.
 
     Args:
         views: photographs in the order of the path: names, patterns ("IMG_01*") or numbers from 0; None: all, in the
@@ -41,7 +41,7 @@ class PhotographPath(CameraPath):
 
 
 def find_views(chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:
-    """Return the numbers of photographs that are given by name, pattern or number.
+    """Return the numbers of photographs given by name, pattern or number.
 
     >>> find_views([2, "b", "*"], ["a", "b", "c"], 3)
     [2, 1, 0, 1, 2]

@@ -1,4 +1,4 @@
-"""A camera path that somebody makes of keyframes: added, changed, read from a file, and saved as one."""
+"""A camera path that the user makes of keyframes: added, changed, read from a file, and saved to one."""
 
 import math
 from collections.abc import Iterator
@@ -23,17 +23,17 @@ ENDING = ".yaml"
 
 
 class RecordedPath:
-    """Keyframes in a capture, in order, and how long the camera takes from each to the next; files lie in `folder`."""
+    """Keyframes in a capture, in order, and the time from each to the next; files are in `folder`."""
 
     def __init__(self, around: PathFrame, folder: Path):
         self.around, self.folder = around, folder
         self.keyframes: list[Keyframe] = []
         self.legs: list[float] = []
-        """Seconds from the keyframe before; that of the first one means nothing."""
+        """Seconds from the previous keyframe; meaningless for the first one."""
 
     @property
     def shape(self) -> float:
-        """Width over height of its pictures, which are the photographs'."""
+        """Width over height of its pictures, as of the photographs."""
         return self.around.width / self.around.height
 
     @property
@@ -42,39 +42,39 @@ class RecordedPath:
         return list(accumulate(self.legs[1:], initial=0.0))
 
     def insert(self, number: int, keyframe: Keyframe) -> None:
-        """Put a keyframe at this place of the list, or say that its picture has no top."""
+        """Insert a keyframe at this place of the list, or say that its picture has no top."""
         keyframe_poses([keyframe], self.around)
         self.keyframes.insert(number, keyframe)
         self.legs.insert(number, USUAL_SECONDS)
 
     def remove(self, number: int) -> None:
-        """Take a keyframe away."""
+        """Remove a keyframe."""
         del self.keyframes[number], self.legs[number]
 
     def views(self) -> list[tuple[Float[Tensor, "3 4"], float]]:
-        """Return the camera to world of each keyframe, and its vertical field of view in radians."""
+        """Return the camera-to-world pose of each keyframe, and its vertical field of view in radians."""
         focals = [keyframe_focal(each, self.around) for each in self.keyframes]
         return list(zip(keyframe_poses(self.keyframes, self.around), map(self._vertical, focals), strict=True))
 
     def curve(self) -> KeyframeCurve | None:
-        """Return the curve through the keyframes; None where there are fewer than two."""
+        """Return the curve through the keyframes; None if there are fewer than two."""
         return KeyframeCurve(self.keyframes, self.around, self.times) if len(self.keyframes) > 1 else None
 
     def view_at(self, curve: KeyframeCurve, seconds: float) -> tuple[Float[Tensor, "3 4"], float]:
-        """Return the camera to world at a time, and its vertical field of view in radians."""
+        """Return the camera-to-world pose at a time, and its vertical field of view in radians."""
         at = torch.tensor([seconds], dtype=curve.knots.dtype).clamp(0.0, float(curve.knots[-1]))
         return curve.poses(at)[0].float(), self._vertical(float(curve.focal(at)))
 
     def files(self) -> list[str]:
-        """Return the names of the keyframe files of the folder, which are no links, the newest first."""
+        """Return the names of the keyframe files in the folder, without links, newest first."""
         try:
             found = [each for each in self.folder.glob(f"[!.]*{ENDING}") if each.is_file() and not each.is_symlink()]
             return [each.name for each in sorted(found, key=lambda each: each.stat().st_mtime, reverse=True)]
-        except OSError:  # somebody is removing one
+        except OSError:  # a file is being removed
             return []
 
     def load(self, name: str) -> None:
-        """Take the keyframes of a file of the folder in place of these, which stay where it is no path here."""
+        """Replace the keyframes with those of a file in the folder; they stay if it is not a valid path here."""
         if name not in self.files():
             raise InputError(f"There is no keyframe file of this name in {self.folder} any more.")
         keyframes = read_keyframes(self.folder / name)
@@ -88,7 +88,7 @@ class RecordedPath:
         return [replace(each, time=round(time, 3)) for each, time in zip(self.keyframes, self.times, strict=True)]
 
     def save(self) -> Path:
-        """Write a file of a new name, and return where it is."""
+        """Write a file with a new name, and return its path."""
         with new_file(self.folder, "camera_path", ENDING) as path:
             write_keyframes(path, self.timed())
         return path
@@ -100,9 +100,10 @@ class RecordedPath:
 def keyframe_of(
     position: Float[Tensor, "3"], look_at: Float[Tensor, "3"], up: Float[Tensor, "3"], fov: float, around: PathFrame
 ) -> Keyframe:
-    """Return a keyframe, in the user's frame, of a camera in the model's.
+    """Return a keyframe, in the user's frame, of a camera in the model's frame.
 
-    `fov` is vertical, in radians. A film has the photographs' shape, not the window's, and keeps this field.
+    `fov` is vertical, in radians. A film has the photographs' aspect ratio, not the window's, and keeps this field of
+    view.
     """
     to_user, shape = around.to_user.double(), around.width / around.height
     rows = [*points_to_user(torch.stack([position, look_at]).double(), to_user)]
@@ -114,9 +115,9 @@ def keyframe_of(
 
 @contextmanager
 def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
-    """Lend a path with the first number that no file has; names never come from the page.
+    """Yield a path with the first number that no file has; names never come from the page.
 
-    An empty file keeps the name, so that of several browsers that save at once each has its own; it goes where the
+    An empty file reserves the name, so that several browsers that save at once get different ones; it is removed if the
     block fails.
     """
     make_folder(folder)
@@ -133,7 +134,7 @@ def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
 
 
 def told(error: Exception) -> str:
-    """Return what to tell a person whose wish could not be granted, or whose file could not be written."""
+    """Return the message for a request that failed, or a file that could not be written."""
     if not isinstance(error, OSError):
         return str(error)
     return f"It could not be saved: {error}. Make room, or start again with another paths.output_dir=DIR."

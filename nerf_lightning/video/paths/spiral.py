@@ -1,4 +1,4 @@
-"""A spiral in front of the scene, as LLFF films captures that were taken from one side."""
+"""A spiral in front of the scene, as LLFF renders captures taken from one side."""
 
 import math
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Spiral(CameraPath):
         target = around.point("target", self.target)
         mean = average_pose(around.poses)
         offsets = (around.poses[:, :, 3] - mean[:, 3]) @ mean[:, :3]
-        # The outermost tenth of the photographs does not count: there, only few of them see the same.
+        # The outermost tenth of the photographs does not count: there, few of them see the same.
         reach = self.reach * torch.quantile(offsets.abs(), 0.9, dim=0)
         angle = 2 * math.pi * torch.arange(self.num_frames).to(mean) / self.num_frames
         wave = torch.stack([(self.turns * angle).cos(), (self.turns * angle).sin(), angle.sin()], dim=-1)

@@ -1,7 +1,7 @@
-"""Smooth curves through cameras: places, directions and numbers that pass through every key.
+"""Smooth curves through cameras: positions, rotations and numbers that pass through every key.
 
-A cubic Hermite curve whose tangents are those of Catmull and Rom for knots that are not evenly spaced. Rotations are
-quaternions: their curve in four dimensions is brought back to unit length.
+A cubic Hermite curve with the tangents of Catmull and Rom for unevenly spaced knots. Rotations are quaternions, whose
+curve in four dimensions is normalized.
 """
 
 from itertools import pairwise
@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
-SHORTEST_LEG = 1e-2  # The shortest leg as a share of the mean one: keys that coincide are a pause.
+SHORTEST_LEG = 1e-2  # The shortest leg as a share of the mean one: coinciding keys are a pause.
 
 
 def hermite(
@@ -41,9 +41,9 @@ def hermite(
 
 
 def even_speed(c2w: Float[Tensor, "keys 3 4"], radius: float, closed: bool) -> Float[Tensor, "knots"]:
-    """Return the times, 0 to 1, at which to pass poses, so that moving and turning take about one speed.
+    """Return the times, 0 to 1, at which to pass poses at about constant speed of moving and turning.
 
-    A leg lasts as long as its distance over `radius` plus its turn in radians. A closed curve has one knot more: that
+    A leg lasts as long as its distance over `radius` plus its turn in radians. A closed curve has one more knot: that
     at which it is back at the first pose.
     """
     keys = torch.cat([c2w, c2w[:1]]) if closed else c2w
@@ -63,12 +63,12 @@ def frame_times(knots: Float[Tensor, "knots"], num_frames: int, closed: bool) ->
 def along(
     knots: Float[Tensor, "knots"], values: Float[Tensor, "keys channels"], at: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames channels"]:
-    """Return the curve at `at`; with a knot more than values it is closed, and smooth where it closes."""
+    """Return the curve at times `at`; with one more knot than values it is closed, and smooth where it closes."""
     return hermite(*_continued(knots, values), at)
 
 
 def _continued(knots: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return knots and values of the curve; of a closed one with a leg more at either end."""
+    """Return knots and values of the curve; for a closed one, with one more leg at either end."""
     if len(knots) == len(values):
         return knots, values
     period = knots[-1] - knots[0]
@@ -80,9 +80,9 @@ def _continued(knots: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
 def rotations_along(
     knots: Float[Tensor, "knots"], rotations: Float[Tensor, "keys 3 3"], at: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames 3 3"]:
-    """Return rotations between those of the keys, each leg the shorter way round."""
+    """Return rotations between those of the keys, each leg the shorter way around."""
     knots, quaternions = _continued(knots, quaternion_from_rotation(rotations))
-    # A quaternion and its negative are one rotation: each takes the sign that is nearer to the one before.
+    # A quaternion and its negative are the same rotation: each takes the sign nearer to the previous one.
     turned = [quaternions[0]]
     for _, following in pairwise(quaternions):
         turned.append(following if turned[-1] @ following >= 0 else -following)

@@ -1,4 +1,4 @@
-"""A loop along the photographs: where they were taken from, upright, with what they show in the middle."""
+"""A loop along the photographs' positions, upright, with what they show in the middle."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,19 +15,17 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
 CROSSED_BY_A_CIRCLE, CROSSED, TIMES_THE_USUAL = 75.0, 25.0, 3.0
-"""Degrees between neighboring photographs, seen from above, over which a path may lead: these, or so many times the
-median where photographs lie farther apart; a circle over at most the first."""
-OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
+"""Maximum gap in degrees between neighboring photographs, seen from above, that a path may cross: the second, or the
+third times the median if that is larger; for a circle, at most the first."""
+OF_AN_ARC = 0.9  # Share that a path to and fro covers: at the ends few photographs see the same.
 NEAREST, FARTHEST = 0.1, 0.9
-"""Quantiles of the photographs' distances: nearer, content leaves the picture; from farther away one sees what no
-photograph shows."""
-STRAY = (
-    3.0  # Times the median distance, beyond which a photograph's place is taken for a mistake of the reconstruction.
-)
-HIGHEST = 80.0  # Degrees; straight above the content a picture has no up.
+"""Quantiles of the photographs' distances: nearer, content leaves the picture; farther, the view shows what no
+photograph does."""
+STRAY = 3.0  # Times the median distance: a photograph beyond it is considered a reconstruction error.
+HIGHEST = 80.0  # Degrees: straight above the content a picture has no up.
 MIDDLE, FRAMED = 2 / 3, 0.95
-"""Of the picture's width and height, and of the content that every frame shows there."""
-EASED = 12  # Of the loop, the part over which steps back are averaged: a twelfth.
+"""Share of the picture's width and height, and share of the content that every frame shows there."""
+EASED = 12  # Steps back are averaged over a twelfth of the loop.
 
 
 @final
@@ -35,9 +33,9 @@ EASED = 12  # Of the loop, the part over which steps back are averaged: a twelft
 class Sweep(CameraPath):
     """Go along the photographs and back to the start, looking at what they show.
 
-    A circle where photographs were taken from all sides, else to and fro along most of them. Height and distance are
-    those of the photographs nearby, so every frame shows what photographs saw. Where a model knows the content, the
-    camera steps back until that is in the middle of the picture; else it is aimed as those nearby.
+    A circle if photographs were taken from all sides, else to and fro along most of them. Height and distance are those
+    of nearby photographs, so every frame shows what photographs saw. If a model knows the content, the camera steps
+    back until it is in the middle of the picture; else it is aimed like nearby photographs.
 
     Args:
         smooth: degrees of azimuth over which height and distance are averaged.
@@ -74,22 +72,22 @@ class Sweep(CameraPath):
             cameras = self.pinholes(look_at(eyes, middle.expand_as(eyes), up), around)
             farthest = math.inf if around.bounded else float(torch.quantile(distances, FARTHEST))
             return step_back(cameras, content, (farthest - distance).clamp(min=0.0))
-        # Aimed as those nearby, of whose axes this is the point nearest to the center.
+        # Aimed like nearby photographs: at the point of their axes nearest to the center.
         aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
         return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)
 
 
 @disable_autocast
 def step_back(cameras: Cameras, content: Float[Tensor, "points 3"], most: Float[Tensor, "frames"]) -> Cameras:
-    """Return the cameras of a loop moved back along their axes, until most of the content is in their middle.
+    """Return a loop's cameras, moved back along their axes until most of the content is in their middle.
 
     A camera whose middle reaches `half` to either side at unit depth shows a point (x, y, -z) there once it has moved
     back by max(|x| / half_x, |y| / half_y) - z.
 
     Args:
         cameras: pinholes.
-        content: points.
-        most: how far each may move.
+        content: points of the content.
+        most: maximum motion of each camera.
     """
     half = 0.5 * MIDDLE * torch.stack([cameras.width, cameras.height], dim=-1) / cameras.focal
     x, y, minus_z = ((content - cameras.c2w[:, None, :, 3]) @ cameras.c2w[:, :, :3]).unbind(dim=-1)
@@ -104,7 +102,7 @@ def step_back(cameras: Cameras, content: Float[Tensor, "points 3"], most: Float[
 
 
 def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "frames"]:
-    """Return a loop of azimuths in degrees: once around, or to and fro over the arc with most photographs.
+    """Return a loop of azimuths in degrees: once around, or to and fro over the arc with the most photographs.
 
     >>> azimuths(torch.tensor([0.0, 60, 120, 180, 240, 300]), 4).tolist()
     [0.0, 90.0, 180.0, 270.0]
@@ -116,7 +114,7 @@ def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "f
     crossed = max(CROSSED, TIMES_THE_USUAL * float(gaps.median()))
     if float(gaps.max()) <= min(crossed, CROSSED_BY_A_CIRCLE):
         return 360.0 * share
-    # Begin after the widest gap, and part the photographs where gaps are wide.
+    # Begin after the widest gap, and split the photographs where gaps are wide.
     first = int(gaps.argmax()) + 1
     along = torch.cat([in_order[first:], in_order[:first] + 360.0])
     ends = (gaps.roll(-first)[:-1] > crossed).nonzero()[:, 0] + 1

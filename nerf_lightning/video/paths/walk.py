@@ -1,4 +1,4 @@
-"""A walk past the photographs, for captures that do not look at one thing: rooms, streets, terraces."""
+"""A walk past the photographs, for captures without a single subject: rooms, streets, terraces."""
 
 from dataclasses import dataclass
 from typing import final
@@ -15,17 +15,17 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spline import even_speed, frame_times, poses_along
 
 STEEP = 0.94
-"""Cosine to the vertical (20 degrees), beyond which level pictures would turn about themselves."""
+"""Cosine to the vertical (20 degrees) beyond which level pictures would spin."""
 DETOUR = 1.5
-"""How many times as long the way in the capture's order may be as the one from neighbor to neighbor."""
+"""Maximum length of the path in the capture's order, in multiples of that from neighbor to neighbor."""
 
 
 @final
 @dataclass
 class Walk(CameraPath):
-    """Go from photograph to photograph, smoothed and level, and look where they look.
+    """Go from photograph to photograph, smoothed and level, looking where they look.
 
-    The order is the capture's, or from neighbor to neighbor where that is much shorter, as for pictures of many people.
+    The order is the capture's, or from neighbor to neighbor if that is much shorter, as for pictures by many people.
 
     Args:
         smooth: number of photographs over which places and directions are averaged (standard deviation).
@@ -60,7 +60,7 @@ def level(
     own_up: Float[Tensor, "keys 3"],
     up: Float[Tensor, "3"],
 ) -> Float[Tensor, "keys 3 4"]:
-    """Return cameras that look `ahead` with level horizons; those that look straight up or down keep their own up."""
+    """Return cameras that look `ahead` with level horizons; those that look up or down steeply keep their own up."""
     up, ahead = normalize(up, dim=0), normalize(ahead, dim=-1)
     steep = ((ahead @ up).abs() > STEEP)[:, None]
     level_ones = look_at(eyes, eyes + ahead, up)
@@ -70,9 +70,9 @@ def level(
 
 @disable_autocast
 def walking_order(poses: Float[Tensor, "views 3 4"], radius: float) -> Int[Tensor, "views"]:
-    """Return the order in which to pass photographs: as they are, or from neighbor to neighbor.
+    """Return the order in which to pass photographs: as given, or from neighbor to neighbor.
 
-    Two are as far apart as their distance over `radius` plus the angle between where they look.
+    The distance of two is their distance over `radius` plus the angle between their directions.
     """
     places, ahead = poses[:, :, 3] / max(radius, 1e-9), -poses[:, :, 2]
     apart = torch.cdist(places, places) + (ahead @ ahead.mT).clamp(-1.0, 1.0).acos()

@@ -1,7 +1,7 @@
-"""Carving by one view for the CPU, in the reference's order of operations, so with its bits; cameras are pinholes.
+"""Carving by one view for the CPU, in the reference's order of operations and thus bit-identical; for pinholes.
 
-The loops have no branches, read coordinates one axis after the other, and know a camera as plain numbers: so they
-become instructions for many cells at a time.
+The loops have no branches, read coordinates one axis after another, and take a camera as plain numbers, so that they
+vectorize over cells.
 """
 
 from typing import no_type_check
@@ -28,7 +28,7 @@ def add_seen(
     centers: Float[Tensor, "cells 3"],
     half_diagonal: float,
 ) -> None:
-    """Mark the cells that a view sees, if only a part of them."""
+    """Mark the cells that a view sees, even partly."""
     over_rows(
         _add_seen, cells.shape[0], cells.numpy(), *_axes(centers), *_camera(cameras, view), *_halves(half_diagonal)
     )
@@ -42,7 +42,7 @@ def carve(
     half_diagonal: float,
     matter: Bool[Tensor, "height width"],
 ) -> None:
-    """Unmark the cells that a view sees whole, with no matter in any of their pixels."""
+    """Unmark the cells that a view sees entirely, with no matter in any of their pixels."""
     pixel, radius = torch.empty(cells.shape, dtype=torch.int32), torch.empty(cells.shape)
     given = (cells.numpy(), *_axes(centers), *_camera(cameras, view), *_halves(half_diagonal))
     over_rows(_find_pixels, cells.shape[0], *given, pixel.numpy(), radius.numpy())
@@ -52,7 +52,7 @@ def carve(
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     size, cells = torch.tensor([8]), torch.zeros(1, dtype=torch.bool)
     lens, middle = torch.zeros(1, 6), torch.full((1, 2), 4.0)
     cameras = Cameras(torch.eye(4)[None, :3], torch.full((1, 2), 4.0), middle, lens, "pinhole", size, size)
@@ -72,14 +72,14 @@ def _camera(cameras: Cameras, view: int) -> tuple[tuple[np.float32, ...], np.int
 
 
 def _halves(half_diagonal: float) -> tuple[np.float32, np.float32]:
-    """Return half the diagonal of a cell, and the depth within which a sphere is too near to tell."""
+    """Return half the diagonal of a cell, and the depth within which a sphere is too close to decide."""
     return np.float32(half_diagonal), np.float32(2.0 * half_diagonal)
 
 
 @njit(error_model="numpy")
 @no_type_check
 def _footprint(x, y, z, camera, half, nearest):
-    # As geometry/footprints.py: where a sphere appears, and the radius of a disc that holds it; 0 where it is unseen.
+    # As geometry/footprints.py: where a sphere appears, and the radius of a disc that contains it; 0 if unseen.
     ax, bx, cx, ox, ay, by, cy, oy, az, bz, cz, oz, focal_x, focal_y, center_x, center_y = camera
     x, y, z = x - ox, y - oy, z - oz
     right, up, depth = x * ax + y * ay + z * az, x * bx + y * by + z * bz, -(x * cx + y * cy + z * cz)
@@ -126,7 +126,7 @@ def _add_seen(first, last, cells, xs, ys, zs, camera, width, height, half, neare
 @njit(nogil=True, error_model="numpy", cache=True)
 @no_type_check
 def _find_pixels(first, last, cells, xs, ys, zs, camera, width, height, half, nearest, pixels, radii):
-    # The pixel in the middle of each cell's disc, and the disc's radius; -1 and 0 where the view shows no whole disc.
+    # The center pixel of each cell's disc, and the disc's radius; -1 and 0 if the view does not show the whole disc.
     for start in range(first, last, CHUNK):
         part = slice(start, min(last, start + CHUNK))
         given = (cells[part], xs[part], ys[part], zs[part], camera, width, height, half, nearest)

@@ -1,4 +1,4 @@
-"""The hash grid for the CPU. The backward pass goes level by level, so two threads never write one entry.
+"""The hash grid for the CPU. The backward pass goes level by level, so two threads never write the same entry.
 
 `lanes` is a tuple of F zeros: its length is part of the compiled signature, so the loops over features become vectors.
 """
@@ -20,15 +20,15 @@ from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 POINTS = 64
-"""So many are taken at a time: their cells are found by vectors, and then what stands there is fetched. Found one by
-one, in the midst of fetching, they keep a processor from looking ahead to memory."""
+"""Points per block: their cells are found with vector instructions, then their entries are fetched. Finding them one by
+one between fetches would keep the processor from prefetching."""
 AHEAD = 8
-"""Memory is asked for the entries of a point so many points before they are used. A processor by itself looks ahead
-over two or three, and where a level does not fit into its caches it would wait most of the time."""
+"""A point's entries are prefetched this many points before they are used. A processor by itself looks ahead over two or
+three, and would wait most of the time for a level that does not fit into its caches."""
 FEATURES = 4
-"""Of a level: kernels are compiled for so many ahead; those for another number compile when they are first used."""
+"""Features per level that kernels are compiled for ahead of time; those for other numbers compile on first use."""
 NEAR_BYTES = 1 << 18
-"""Levels up to this size are in the caches anyway."""
+"""Levels up to this size in bytes are in the caches anyway."""
 SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 NONE, NEXT = np.int32(0), np.int32(1)
@@ -57,12 +57,12 @@ def add_table_gradient(
 def add_table_gradients(
     into: Float[Tensor, "entries features"], found: Sequence[tuple[Tensor, Tensor]], layout: HashGridLayout
 ) -> None:
-    """Add several gradients with respect to the table, one after the other.
+    """Add several gradients with respect to the table, one after another.
 
     Args:
-        into: as large as the table.
-        found: sets of points, `points 3`, each with the gradients of their features, `points out`.
-        layout: where the levels' entries lie.
+        into: the sum, of the table's size.
+        found: sets of points, `points 3`, each with the gradient of their features, `points out`.
+        layout: where the levels' entries are.
     """
     table, of_layout = into.numpy(), (*level_arrays(layout), (0,) * into.shape[1])
     arrays = [(points.numpy(), grad.numpy()) for points, grad in found]
@@ -71,7 +71,7 @@ def add_table_gradients(
         for points, grad in arrays:
             _add_table_gradient(level, table, points, grad, *of_layout)
 
-    # Fine levels take longest: they come first.
+    # Fine levels take longest, so they come first.
     in_parallel(add, range(len(layout.resolutions))[::-1])
 
 
@@ -90,7 +90,7 @@ def point_gradient(
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3)
     table, grad = torch.zeros(layout.offsets[-1], FEATURES), torch.ones(4, 2 * FEATURES)
     forward(table, points, layout)
@@ -99,7 +99,7 @@ def trial() -> None:
 
 
 def level_arrays(layout: HashGridLayout) -> tuple[Any, ...]:
-    """Return what the kernels take of a layout."""
+    """Return a layout as arguments of the kernels."""
     resolutions = np.array(layout.resolutions, np.int32)
     hashed = np.array([layout.is_hashed(level) for level in range(len(resolutions))])
     return resolutions, np.array(layout.offsets, np.int64), hashed, np.uint32(layout.table_size - 1)
@@ -109,7 +109,7 @@ def level_arrays(layout: HashGridLayout) -> tuple[Any, ...]:
 @no_type_check
 def _cell(coordinate, resolution):
     scaled = min(max(coordinate, np.float32(0.0)), ONE) * np.float32(resolution)
-    cell = max(min(np.int32(scaled), np.int32(resolution - 1)), NONE)  # whatever the coordinate is
+    cell = max(min(np.int32(scaled), np.int32(resolution - 1)), NONE)  # for any coordinate
     return cell, np.float32(scaled - np.float32(cell))
 
 
@@ -148,8 +148,8 @@ def _weights(x, y, z):
     return u * a, x * a, u * b, x * b, u * c, x * c, u * d, x * d
 
 
-# Numbers of POINTS points lie side by side, and the entries and weights of their eight corners after one another, so
-# that the compiler makes vectors of these loops. A cell lies in the grid whatever the point is.
+# The values of POINTS points are adjacent, and those of their eight corners' entries and weights follow one another, so
+# that the compiler vectorizes these loops. The cell is in the grid for any point.
 @njit(fastmath=True)
 @no_type_check
 def _take_points(points, first, count, p):
@@ -216,8 +216,8 @@ def _find(p, resolution, hashed, mask, e, w):
         _find_dense(p, resolution, e, w)
 
 
-# Two or four features are kept in registers as one vector: written one by one, the compiler must fear that what it
-# stores is what it loads next, and takes up to seven times as long. An unsigned index needs no test for a negative one.
+# Two or four features are kept in registers as one vector: written one by one, the compiler must assume that stores and
+# loads alias, and the code takes up to seven times as long. An unsigned index needs no test for a negative one.
 @njit(fastmath=True)
 @no_type_check
 def _take_two(table, index, weight, a, b):
@@ -308,7 +308,7 @@ def _scatter(into, offset, e, w, i, grad, row, column, lanes):
 
 @intrinsic
 def _fetch(context: Any, address: Any) -> Any:
-    """Ask memory for what stands at an address, and do not wait for it."""
+    """Prefetch the memory at an address."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place, word = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -395,7 +395,7 @@ def write_point_gradient(first, last, table, points, grad, resolutions, offsets,
                 gx += (value if k & 1 else -value) * wy * wz
                 gy += (value if k & 2 else -value) * wx * wz
                 gz += (value if k & 4 else -value) * wx * wy
-        # Outside of the cube the features do not change.
+        # Outside the cube the features are constant.
         out[i, 0] = gx if 0.0 <= points[i, 0] <= 1.0 else np.float32(0.0)
         out[i, 1] = gy if 0.0 <= points[i, 1] <= 1.0 else np.float32(0.0)
         out[i, 2] = gz if 0.0 <= points[i, 2] <= 1.0 else np.float32(0.0)

@@ -1,4 +1,4 @@
-"""The hash grid for CUDA: a program takes a block of points on one level; the backward pass adds atomically.
+"""The hash grid for CUDA: a program processes a block of points on one level; the backward pass adds atomically.
 
 Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
@@ -25,7 +25,7 @@ def forward(
     layout: HashGridLayout,
     used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
-    """Return the features; zeros from point `used` on, up to a block."""
+    """Return the features; zeros from point `used` on, rounded up to a block."""
     levels, features = len(layout.resolutions), table.shape[1]
     out = torch.empty(points.shape[0], levels * features, device=points.device)
     if points.shape[0]:
@@ -51,7 +51,7 @@ def add_table_gradient(
     layout: HashGridLayout,
     used: Int[Tensor, "1"] | None = None,
 ) -> None:
-    """Add the gradient with respect to the table to `into`; nothing flows back from point `used` on."""
+    """Add the gradient with respect to the table to `into`; points from `used` on have none."""
     levels, features = len(layout.resolutions), into.shape[1]
     if points.shape[0]:
         grid = (triton.cdiv(points.shape[0], BLOCK), levels)
@@ -74,7 +74,7 @@ def point_gradient(
     grad: Float[Tensor, "points out"],
     layout: HashGridLayout,
 ) -> Float[Tensor, "points 3"]:
-    """Return the gradient with respect to the points, by the reference: it is wanted seldom."""
+    """Return the gradient with respect to the points, by the reference: it is rarely needed."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_()
         interpolate_torch(table.float(), leaf, layout).backward(grad)
@@ -83,25 +83,25 @@ def point_gradient(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
     table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)
     used = torch.full((1,), 3, device=device)
     for count in (None, used):
         forward(table, points, layout, count)
         add_table_gradient(table, points, grad, layout, count)
-    if not bool(table.isfinite().all()):  # read, so that a fault in the kernels shows here
+    if not bool(table.isfinite().all()):  # read, so that a fault in the kernels appears here
         raise RuntimeError("a trial of its kernels gave numbers that are not finite")
 
 
-# Kept: made anew, these numbers would go from the host to the device in each call, and the host would wait for it.
+# Cached: otherwise each call would copy these numbers to the device, and the host would wait for it.
 @functools.cache
 def _levels(layout: HashGridLayout, device: torch.device) -> tuple[Tensor, Tensor, Tensor, int]:
     hashed = [int(layout.is_hashed(level)) for level in range(len(layout.resolutions))]
     resolution, hashed_there = (
         torch.tensor(row, dtype=torch.int32, device=device) for row in (layout.resolutions, hashed)
     )
-    # Numbers of entries times their features may exceed 32 bits.
+    # Entry indices times features may exceed 32 bits.
     offset = torch.tensor(layout.offsets[:-1], dtype=torch.int64, device=device)
     return resolution, offset, hashed_there, layout.table_size - 1
 
@@ -146,7 +146,7 @@ def _corner(corner: tl.constexpr, x, y, z, fx, fy, fz, resolution, offset, hashe
 @triton.jit
 @no_type_check
 def _level_of(resolutions, offsets, hashed_levels, count, width: tl.constexpr, block: tl.constexpr):
-    """Return the points and the features of a program, and its level; a lane has an entry's features in one piece."""
+    """Return a program's points and features, and its level; a lane has all features of an entry."""
     row = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)[:, None]
     level = tl.program_id(1)
     resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
@@ -211,9 +211,9 @@ def _backward(
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
     at = grad + row * (levels * features) + level * features + feature
     flowing = tl.load(at, mask=valid & (feature < features), other=0.0)
-    # Most of what flows back is zero, from padding and from what lies behind surfaces.
+    # Most gradients are zero, from padding and from behind surfaces.
     flows = valid & (tl.max(tl.abs(flowing), axis=1, keep_dims=True) != 0.0) & (feature < features)
     for corner in tl.static_range(8):
         entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
-        # Relaxed: nobody reads before the kernel ends, and stricter ones empty the cache.
+        # Relaxed: nothing reads these before the kernel ends, and stricter semantics flush the cache.
         tl.atomic_add(into + entry * features + feature, weight * flowing, mask=flows, sem="relaxed")

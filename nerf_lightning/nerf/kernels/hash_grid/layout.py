@@ -1,6 +1,6 @@
-"""How many cells each level of a multiresolution hash grid has, and where its entries lie (Sec. 3, arXiv 2201.05989).
+"""The resolution of each level of a multiresolution hash grid, and where its entries are (Sec. 3, arXiv 2201.05989).
 
-Letters: R_l the cells along a side of level l, T the most entries of a level's table.
+Letters: R_l the cells along a side of level l, T the maximum number of entries of a level's table.
 """
 
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class HashGridLayout:
-    """Where each level's entries lie in the one table."""
+    """Where each level's entries are in the shared table."""
 
     resolutions: tuple[int, ...]
     """R_l, cells along a side."""
     offsets: tuple[int, ...]
-    """First entry of each level, and the number of entries in all."""
+    """First entry of each level, and the total number of entries."""
     table_size: int
     """T, a power of two."""
 
@@ -22,7 +22,7 @@ class HashGridLayout:
         return (self.resolutions[level] + 1) ** 3 > self.table_size
 
     def coarsest(self, levels: int) -> "HashGridLayout":
-        """Return the layout of the first so many levels, in the same table."""
+        """Return the layout of the `levels` coarsest levels, in the same table."""
         return HashGridLayout(self.resolutions[:levels], self.offsets[: levels + 1], self.table_size)
 
 

@@ -1,6 +1,7 @@
 """Multiresolution hash grid: features interpolated between the vertices of grids of growing resolution.
 
-Sec. 3 of arXiv 2201.05989. Letters: R_l the cells along a side of level l, T the most entries of a level's table,
+Sec. 3 of arXiv 2201.05989. Letters: R_l the cells along a side of level l, T the maximum number of entries of a level's
+table,
 F the features of an entry.
 """
 
@@ -28,16 +29,16 @@ def interpolate(
     known: Float[Tensor, "points out"] | None = None,
     used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
-    """Return the trilinear features of points in the unit cube, level by level; points outside are moved to its face.
+    """Return the trilinear features of points in the unit cube, level by level; points outside are clamped to it.
 
-    Gradients go to the table and, where asked for, to the points. Once differentiable.
+    Gradients flow to the table and, if needed, to the points. Once differentiable.
 
     Args:
-        table: the entries of all levels.
+        table: all levels' entries.
         points: in the unit cube.
-        layout: where the levels' entries lie.
-        known: what this function returned for the same arguments without gradients: it is not computed again.
-        used: on CUDA, the point from which on all is padding: kernels do not compute it, and no gradient comes from it.
+        layout: where the levels' entries are.
+        known: what this function returned for the same arguments without gradients, to avoid recomputing it.
+        used: on CUDA, the index from which all points are padding: kernels skip it, and it has no gradients.
     """
     backend = cpu_backend("hash_grid.cpu", points.device) or cuda_backend("hash_grid.cuda", points.device)
     if backend is None or table.dtype == torch.float64:
@@ -48,7 +49,7 @@ def interpolate(
 
 @dataclass(frozen=True)
 class TableGradient:
-    """What a backward pass would add to the gradients of a table."""
+    """A deferred contribution of a backward pass to a table's gradient."""
 
     table: Float[Tensor, "entries features"]
     points: Float[Tensor, "points 3"]
@@ -58,7 +59,7 @@ class TableGradient:
 
 
 def add_all(held: Sequence[TableGradient], scale: float = 1.0) -> None:
-    """Add what was held back, the gradients of one table together: threads are not woken for each."""
+    """Add deferred gradients, those of one table together, so that threads are not woken for each."""
     for same in {(id(each.table), each.layout): each for each in held}.values():
         table, layout = same.table, same.layout
         if table.grad is None:
@@ -76,20 +77,20 @@ def table_gradient(
     kernels: ModuleType,
     padding: tuple[Tensor, ...] = (),
 ) -> Float[Tensor, "entries features"] | None:
-    """Return a table's gradient in a backward pass; None where it is held back, or was added in place.
+    """Return a table's gradient in a backward pass; None if it is deferred, or was added in place.
 
     Args:
         table: as autograd knows it.
         points: in the unit cube.
-        grad: of their features.
-        layout: where the levels' entries lie.
-        kernels: with `add_table_gradient`.
+        grad: gradient of their features.
+        layout: where the levels' entries are.
+        kernels: the module with `add_table_gradient`.
         padding: on CUDA, where padding begins (`interpolate`).
     """
     if _held.gradients is not None:
         _held.gradients.append(TableGradient(table, points, grad, layout, kernels))
         return None
-    # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh table of
+    # An optimizer that keeps its gradients allocated sets this flag: then they are added in place, since a new table of
     # zeros for each tile costs more than the gradients themselves.
     kept = table.grad if getattr(table, "grad_in_place", False) else None
     into = torch.zeros_like(table, dtype=torch.float32) if kept is None else kept
@@ -99,9 +100,9 @@ def table_gradient(
 
 @contextmanager
 def defer_table_grads() -> Iterator[Sequence[TableGradient]]:
-    """Let backward passes of this thread collect gradients of tables instead of adding them.
+    """Make backward passes of this thread collect gradients of tables instead of adding them.
 
-    Two threads must not add to one table, and a table for each would cost more than the gradients themselves.
+    Two threads must not add to the same table, and a table for each would cost more than the gradients themselves.
     """
     former, _held.gradients = _held.gradients, []
     try:

@@ -7,7 +7,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861
-"""Of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table's size (Eq. 4)."""
+"""Primes of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table size (Eq. 4)."""
 
 
 def interpolate_torch(

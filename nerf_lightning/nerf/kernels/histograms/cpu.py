@@ -1,6 +1,6 @@
-"""Histograms along rays for the CPU: samples drawn from them, and the losses that compare and narrow them.
+"""Histograms along rays for the CPU: sampling, and the interlevel and distortion losses.
 
-Letters as in `rendering.histograms` and `losses.proposal`, whose functions these are in one pass over each ray.
+Letters as in `rendering.histograms` and `losses.proposal`; these are the same functions in one pass over each ray.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def stratified_edges(
     high: Float[Tensor, "*rays"],
     contracted: bool,
 ) -> Float[Tensor, "*rays edges"] | None:
-    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
+    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: mapped back to distances."""
     if not takes_bounds(low, high):
         return None
     out, shift = torch.empty(len(low), len(shares)), torch.empty(len(low), 0) if jitter is None else jitter
@@ -59,12 +59,12 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
 
 
 def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"] | None:
-    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for the weights alone."""
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients only for the weights."""
     return distortion(_over_rays(_distortion, rendering.samples.contracted_spacing), rendering)
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]]), torch.ones(1, 2)
     sample_histogram(edges, weights, torch.tensor([[0.5]]), 0.01, True)
     stratified_edges(edges[0], torch.zeros(1, 1), edges[:, 0], edges[:, 2], True)
@@ -82,7 +82,7 @@ def _over_rays(kernel: Any, *flags: bool) -> Callable[..., None]:
 @njit
 @no_type_check
 def _spaced(distance, contracted):
-    # In which even steps are even: `geometry.contraction.normalized_distance`.
+    # To the sampling space: `geometry.contraction.normalized_distance`.
     if not contracted:
         return distance
     return HALF * distance if distance < ONE else ONE - HALF / distance
@@ -91,7 +91,7 @@ def _spaced(distance, contracted):
 @njit
 @no_type_check
 def _distance(spaced, contracted):
-    # Back again: `geometry.contraction.from_normalized_distance`.
+    # From the sampling space: `geometry.contraction.from_normalized_distance`.
     if not contracted:
         return spaced
     return TWO * spaced if spaced < HALF else HALF / max(ONE - spaced, LEAST_LEFT)

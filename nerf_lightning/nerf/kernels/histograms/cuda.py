@@ -1,6 +1,6 @@
-"""Histograms along rays for CUDA: a program has a ray, and compares all of its bins at once.
+"""Histograms along rays for CUDA: a program processes a ray, and compares all of its bins at once.
 
-Letters as in `rendering.histograms` and `losses.proposal`. The results are the same in each run.
+Letters as in `rendering.histograms` and `losses.proposal`. Results are deterministic.
 `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
@@ -18,7 +18,7 @@ from nerf_lightning.nerf.kernels.histograms.op import RayLoss, distortion, inter
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 LANES = 32
-"""Samples that are looked for in all bins at a time."""
+"""Number of samples searched in all bins at a time."""
 BINS_OF_A_WARP = 64
 
 
@@ -49,13 +49,13 @@ def stratified_edges(
     high: Float[Tensor, "*rays"],
     contracted: bool,
 ) -> Float[Tensor, "*rays edges"] | None:
-    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: taken back to distances."""
+    """Return low + shares (high - low), the inner ones moved by `jitter`; contracted: mapped back to distances."""
     if not takes_bounds(low, high):
         return None
     rays, count = len(low), len(shares)
     out = torch.empty(rays, count, device=low.device)
     if rays:
-        shift = shares if jitter is None else jitter  # which is not looked at where there is none
+        shift = shares if jitter is None else jitter  # unused without jitter
         arrays = shares.contiguous(), shift.contiguous(), low.contiguous(), high.contiguous(), out
         block = triton.next_power_of_2(count)
         _stratified[(rays,)](*arrays, TINY, count, jitter is not None, contracted, block, num_warps=_warps(block))
@@ -68,12 +68,12 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
 
 
 def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"] | None:
-    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for the weights alone."""
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients only for the weights."""
     return distortion(_on_rays(_distortion, rendering.samples.contracted_spacing), rendering)
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     edges, weights = torch.tensor([[0.0, 1.0, 2.0]], device=device), torch.ones(1, 2, device=device)
     found = sample_histogram(edges, weights, torch.full((1, 1), 0.5, device=device), 0.01, False)
     stratified_edges(edges[0], edges[:, :1], edges[:, 0], edges[:, 2], True)
@@ -99,7 +99,7 @@ def _warps(block: int) -> int:
 @triton.jit
 @no_type_check
 def _spaced(distance, contracted: tl.constexpr):
-    """In which even steps are even: `geometry.contraction.normalized_distance`."""
+    """Map to the sampling space: `geometry.contraction.normalized_distance`."""
     if contracted:
         distance = tl.where(distance < 1.0, 0.5 * distance, 1.0 - 0.5 / tl.maximum(distance, 1.0))
     return distance
@@ -108,7 +108,7 @@ def _spaced(distance, contracted: tl.constexpr):
 @triton.jit
 @no_type_check
 def _distance(spaced, tiny, contracted: tl.constexpr):
-    """Back again: `geometry.contraction.from_normalized_distance`."""
+    """Map from the sampling space: `geometry.contraction.from_normalized_distance`."""
     if contracted:
         spaced = tl.where(spaced < 0.5, 2.0 * spaced, 0.5 / tl.maximum(1.0 - spaced, tiny))
     return spaced
@@ -121,7 +121,7 @@ def _stratified(
 ):
     ray, k = tl.program_id(0).to(tl.int64), tl.arange(0, block)
     share = tl.load(shares + k, mask=k < count, other=0.0)
-    if jittered:  # the first and the last stay
+    if jittered:  # the first and the last are not moved
         share += tl.load(shift + ray * (count - 2) + k - 1, mask=(k > 0) & (k < count - 1), other=0.0)
     begin, end = tl.load(low + ray), tl.load(high + ray)
     tl.store(out + ray * count + k, _distance(begin + share * (end - begin), tiny, contracted), mask=k < count)
@@ -143,7 +143,7 @@ def _sample(
     for start in range(0, count, lanes):
         k = start + tl.arange(0, lanes)
         wanted = tl.load(u + ray * count + k, mask=k < count, other=0.0)
-        # As many bins end at or before it; the last one holds what rounding leaves beyond its end.
+        # The number of bins that end at or before it; the last bin takes what rounding leaves beyond its end.
         number = tl.sum(((above[None, :] <= wanted[:, None]) & there[None, :]).to(tl.int32), axis=1)
         mine = bin_index[None, :] == tl.minimum(number, bins - 1)[:, None]
         first = tl.sum(tl.where(mine, below[None, :], 0.0), axis=1)
@@ -192,7 +192,7 @@ def _distortion(w, edges, out, grad, bins, samples, contracted: tl.constexpr, bl
     begin = _spaced(tl.load(row + i, mask=there, other=0.0), contracted)
     end = _spaced(tl.load(row + i + 1, mask=there, other=0.0), contracted)
     m, length = (0.5 * (begin + end) - first) / span, (end - begin) / span
-    # Sums over the samples before and behind each.
+    # Sums over the samples before and after each.
     moment = weight * m
     before, behind = tl.cumsum(weight, axis=0) - weight, tl.cumsum(weight, axis=0, reverse=True) - weight
     nearer = m * before - (tl.cumsum(moment, axis=0) - moment)

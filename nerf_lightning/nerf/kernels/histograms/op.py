@@ -1,4 +1,4 @@
-"""What the kernels of histograms along rays take on every device; and losses whose gradient is found with them."""
+"""What histogram kernels accept on every device, and losses whose gradient is computed along with their value."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
 class RayLoss(torch.autograd.Function):
-    """Apply it to what computes, the weights that have a gradient, and whatever else the number depends on."""
+    """Apply it to the function that computes, the weights that have a gradient, and the loss's other inputs."""
 
     @staticmethod
     def forward(ctx: Any, compute: Callable[..., None], weights: Tensor, *given: Tensor) -> Float[Tensor, "rays"]:
@@ -32,13 +32,13 @@ class RayLoss(torch.autograd.Function):
 
 
 def takes_histogram(edges: Tensor, weights: Tensor, u: Tensor) -> bool:
-    """Return whether kernels sample a histogram: without gradients, of float32 rays in a row."""
+    """Return whether kernels can sample a histogram: without gradients, for contiguous float32 rays."""
     plain = _are_rows(edges, weights, u) and edges.shape[1] == weights.shape[1] + 1
     return plain and not (edges.requires_grad or weights.requires_grad)
 
 
 def takes_bounds(low: Tensor, high: Tensor) -> bool:
-    """Return whether kernels divide what lies between bounds: without gradients, of float32 rays in a row."""
+    """Return whether kernels can divide the range between bounds: without gradients, for contiguous float32 rays."""
     plain = low.dim() == 1 and low.dtype == torch.float32
     return plain and not (low.requires_grad or high.requires_grad)
 
@@ -46,7 +46,7 @@ def takes_bounds(low: Tensor, high: Tensor) -> bool:
 def interlevel(
     compute: Callable[..., None], last: DenseRendering, proposal: DenseRendering
 ) -> Float[Tensor, "rays"] | None:
-    """Return a kernel's interlevel loss, with gradients for the proposal's weights; None where rays are in no row."""
+    """Return a kernel's interlevel loss, with gradients for the proposal's weights; None if rays are not contiguous."""
     if not _are_rows(last.weights, proposal.weights):
         return None
     given = last.samples.edges, last.weights, proposal.samples.edges
@@ -54,7 +54,7 @@ def interlevel(
 
 
 def distortion(compute: Callable[..., None], rendering: DenseRendering) -> Float[Tensor, "rays"] | None:
-    """Return a kernel's distortion loss, with gradients for the weights; None where the edges have some, too."""
+    """Return a kernel's distortion loss, with gradients for the weights; None if the edges need gradients, too."""
     edges, weights = rendering.samples.edges, rendering.weights
     return RayLoss.apply(compute, weights, edges) if _are_rows(weights) and not edges.requires_grad else None
 

@@ -1,4 +1,4 @@
-"""Newton's iteration that takes a lens's distortion away, for the CPU (`geometry.lenses`)."""
+"""Newton's iteration that undistorts lenses, for the CPU (`geometry.lenses`)."""
 
 from typing import no_type_check
 
@@ -13,7 +13,7 @@ from nerf_lightning.nerf.kernels.threads import over_rows
 def undistort(
     plane: Float[Tensor, "*points 2"], lens: Float[Tensor, "*#points 6"], steps: int
 ) -> Float[Tensor, "*points 2"] | None:
-    """Return where the lens takes its places in the plane from; None where gradients are wanted."""
+    """Return the undistorted positions that the lens shows at positions in the plane; None if gradients are needed."""
     if plane.requires_grad or lens.requires_grad:
         return None
     rows, of_rows = plane.reshape(-1, 2), lens.expand(*plane.shape[:-1], 6).reshape(-1, 6)
@@ -23,7 +23,7 @@ def undistort(
 
 
 def trial() -> None:
-    """Run the kernel once on next to nothing, in both precisions; it raises whatever its compiler raises."""
+    """Run the kernel once on tiny input, in both precisions; it raises whatever the compiler raises."""
     for dtype in (torch.float32, torch.float64):
         undistort(torch.zeros(1, 2, dtype=dtype), torch.zeros(1, 6, dtype=dtype), 1)
 

@@ -1,4 +1,4 @@
-"""The march for the CPU: cells that are empty, and whole blocks of them with what is empty around, are stepped over."""
+"""The march for the CPU: it skips empty cells, and whole empty blocks with the empty blocks around them."""
 
 from typing import no_type_check
 
@@ -19,7 +19,7 @@ FAR_AWAY = np.float32(1e30)
 def march(
     rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells, limit: int | None
 ) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
-    """Return the occupied intervals and where each ray would go on."""
+    """Return the occupied intervals and where each ray would continue."""
     count, edges = rays.near.shape[0], lattice.shape[0]
     most = min(edges, limit if limit is not None else edges)
     ray = (*grid.in_box(rays), state.enter, state.leave, state.jitter)
@@ -35,7 +35,7 @@ def march(
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -74,7 +74,7 @@ def first_from(lattice, jitter, k, t):
 @njit(fastmath=True)
 @no_type_check
 def _ahead(unit, speed, around):
-    # Distance to the end of the cell, of side 1, that `unit` lies in and of so many around it, along one axis.
+    # Distance along one axis to the end of the cell (side 1) that contains `unit`, and of `around` cells beyond it.
     if speed > 0:
         return (np.floor(unit) + ONE + around - unit) / speed
     if speed < 0:
@@ -85,7 +85,7 @@ def _ahead(unit, speed, around):
 @njit(fastmath=True)
 @no_type_check
 def _end_of_empty(x, y, z, dx, dy, dz, leap, scale):
-    # Distance to the end of what is empty around a point, in units of cells: its cell, or blocks; a hair short.
+    # Distance to the end of the empty space (a cell, or blocks) around a point given in cells; slightly short.
     around = np.float32(0.0)
     if leap > 0:
         shrink, around = ONE / np.float32(BLOCK), np.float32(leap) - ONE
@@ -97,7 +97,7 @@ def _end_of_empty(x, y, z, dx, dy, dz, leap, scale):
 @njit(fastmath=True)
 @no_type_check
 def _skip(lattice, jitter, k, t, ahead):
-    # The first interval after k whose middle, at t, is so far ahead; never one too far.
+    # The first interval after k (whose middle is at t) that is so far ahead; never one too far.
     end = lattice.shape[0] - 2
     longest = lattice[end + 1] - lattice[end]
     k += max(1, int(ahead / longest))
@@ -109,7 +109,7 @@ def _skip(lattice, jitter, k, t, ahead):
 @njit(fastmath=True)
 @no_type_check
 def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k):
-    """Return the first interval from k on that is occupied; the lattice's end where there is none."""
+    """Return the first occupied interval from k on; the lattice's end if there is none."""
     end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[0])
     last, scale = resolution - np.int32(1), HALF * np.float32(resolution)
     while k < end:
@@ -132,7 +132,7 @@ def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, 
 @njit(fastmath=True)
 @no_type_check
 def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k, numbers):
-    # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
+    # Write the numbers of the occupied intervals from k on; return how many, and where to continue.
     end, found = lattice.shape[0] - 2, 0
     while found < numbers.shape[0]:
         k = next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k)

@@ -1,7 +1,7 @@
-"""The march for CUDA: a lane walks along a part of a ray, and steps over cells and whole blocks that are empty.
+"""The march for CUDA: a lane walks along a part of a ray, and skips empty cells and whole empty blocks.
 
-It notes which intervals are occupied; once it is known how many lie before each part, they are written in a row.
-`TRITON_INTERPRET=1` runs the kernels without a GPU. The results are the same in each run.
+It notes which intervals are occupied; once the number before each part is known, they are written contiguously.
+`TRITON_INTERPRET=1` runs the kernels without a GPU. Results are deterministic.
 """
 
 from typing import no_type_check
@@ -17,9 +17,9 @@ from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
 LANES = 256
 WALKS = 32
-"""Of a program: a warp, whose lanes wait for each other."""
+"""Walks per program: a warp, whose lanes wait for each other."""
 PARTS = 8
-"""That a ray is walked in at once: a step of a walk waits for memory, and a batch's rays alone do not fill a GPU."""
+"""Parts of a ray that are walked at once: steps wait for memory, and a batch's rays alone do not fill a GPU."""
 
 
 def march(
@@ -30,9 +30,9 @@ def march(
     limit: int | None,
     capacity: int | None,
 ) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
-    """Return the occupied intervals and where each ray would go on; the arguments are those of `march.march`."""
+    """Return the occupied intervals and where each ray would continue; the arguments are those of `march.march`."""
     count, intervals, device = rays.near.shape[0], lattice.shape[0] - 2, lattice.device
-    # How far a ray goes that takes a limited number is known at its end alone.
+    # How far a ray with limited samples goes is known only at its end.
     parts, longest = (PARTS, intervals) if limit is None else (1, min(limit, intervals))
     room = triton.cdiv(longest, parts)
     walks = count * parts
@@ -49,7 +49,7 @@ def march(
     if capacity is None:
         capacity = int(found)
     else:
-        ends_of_walks = ends_of_walks.clamp(max=capacity)  # the last rays lose what does not fit
+        ends_of_walks = ends_of_walks.clamp(max=capacity)  # what does not fit is dropped from the last rays
     index = torch.empty(capacity, dtype=torch.int64, device=device)
     starts, ends = torch.empty(capacity, device=device), torch.empty(capacity, device=device)
     out = bounds, index, starts, ends
@@ -61,7 +61,7 @@ def march(
 def distances_in_box(
     rays: RayBundle, aabb: Float[Tensor, "2 3"]
 ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]] | None:
-    """Return where each ray enters and leaves a box; None where rays are not in a row, or gradients are wanted."""
+    """Return where each ray enters and leaves a box; None if rays are not contiguous, or gradients are needed."""
     if rays.near.dim() != 1 or rays.origins.requires_grad or rays.directions.requires_grad:
         return None
     enter, leave = torch.empty_like(rays.near), torch.empty_like(rays.near)
@@ -73,7 +73,7 @@ def distances_in_box(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     one, along = torch.ones(1, device=device), torch.tensor([[0.0, 0.0, 1.0]], device=device)
     rays = RayBundle(-2 * along, along, one, 3 * one, along)
     cells = torch.ones(4, 4, 4, dtype=torch.uint8, device=device)
@@ -89,7 +89,7 @@ def trial(device: str = "cuda") -> None:
 @triton.jit
 @no_type_check
 def _in_box(origins, directions, aabb, ray, valid, axis: tl.constexpr):
-    """Return one coordinate of origins and directions where the box is the cube from -1 to 1."""
+    """Return one coordinate of origins and directions, in coordinates where the box is the cube from -1 to 1."""
     low, high = tl.load(aabb + axis), tl.load(aabb + 3 + axis)
     half = 0.5 * (high - low)
     origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0) - 0.5 * (low + high)
@@ -99,7 +99,7 @@ def _in_box(origins, directions, aabb, ray, valid, axis: tl.constexpr):
 @triton.jit
 @no_type_check
 def _between_faces(origins, directions, aabb, ray, valid, axis: tl.constexpr):
-    """Return where rays pass the two faces of the box on an axis, the nearer first."""
+    """Return where rays cross the two faces of the box on an axis, the nearer first."""
     direction = tl.load(directions + 3 * ray + axis, mask=valid, other=1.0)
     inverse = 1.0 / tl.where(direction == 0.0, 1e-20, direction)
     origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0)
@@ -131,7 +131,7 @@ def _middle(lattice, jitter, k):
 @triton.jit
 @no_type_check
 def _ahead(unit, speed, around):
-    """Return the distance to the end of the cell, of side 1, that `unit` lies in and of `around` more, on one axis."""
+    """Return the distance along one axis to the end of the cell (side 1) that contains `unit`, and of `around` more."""
     still = speed == 0.0
     edge = tl.where(speed > 0.0, tl.floor(unit) + 1.0 + around, tl.floor(unit) - around)
     return tl.where(still, 1e30, (edge - unit) / tl.where(still, 1.0, speed))
@@ -160,7 +160,7 @@ def _march(
     scale, blocks = 0.5 * resolution, resolution // side
     found, into = tl.zeros([block], tl.int32), noted + walk.to(tl.int64) * room
     alive = valid & (near < far) & (k < last)
-    # Rays outside of the box pass to the lattice's end at once.
+    # Rays that miss the box go to the lattice's end at once.
     k = tl.where(valid & ~(near < far), intervals, k)
     while tl.max(alive.to(tl.int32), axis=0) > 0:
         at = tl.where(alive, k, 0)
@@ -176,7 +176,7 @@ def _march(
         occupied = asks & (tl.load(cells + (a * resolution + b) * resolution + c, mask=asks, other=0) != 0)
         tl.store(into + found, at, mask=occupied)
         found += occupied.to(tl.int32)
-        # To the end of what is empty around, a hair short: no interval too far.
+        # To the end of the empty space around, slightly short: never an interval too far.
         leap = tl.load(leaps + ((a // side) * blocks + b // side) * blocks + c // side, mask=asks, other=0)
         wide = leap > 0
         shrink, around = tl.where(wide, 1.0 / side, 1.0), tl.where(wide, leap.to(tl.float32) - 1.0, 0.0)
@@ -185,7 +185,7 @@ def _march(
             tl.minimum(_ahead(x * shrink, dx * speed, around), _ahead(y * shrink, dy * speed, around)),
             _ahead(z * shrink, dz * speed, around),
         )
-        # Before the box: one step less than leads to where the ray enters.
+        # Before the box: one step less than to where the ray enters.
         ahead = tl.where(asks, ahead * 0.9999, tl.maximum(near - t, 0.0) - longest)
         skipped = tl.maximum(tl.minimum(ahead / longest, 1048576.0).to(tl.int32), 1)
         k = tl.where(alive & ~ended, k + tl.where(occupied, 1, skipped), k)
@@ -194,7 +194,7 @@ def _march(
     tl.store(ends_of_walks + 1 + walk, found.to(tl.int64), mask=valid)
     if tl.program_id(0) == 0:
         tl.store(ends_of_walks, 0)
-    # Of several walks the last one says where the ray would go on; they leave nothing behind.
+    # The last of a ray's walks says where it would continue; after several walks nothing is left.
     tl.store(following + ray, tl.minimum(k, intervals).to(tl.int64), mask=valid & (walk % parts == parts - 1))
 
 
@@ -216,7 +216,7 @@ def _write(
             slot = start + lane
             inside = slot < last
             own = (slot[:, None] >= begins[None, :]) & (slot[:, None] < stops[None, :])
-            # Where the interval's number stands: in the row of its walk.
+            # Where the interval's number is stored: in the row of its walk.
             at = tl.sum(tl.where(own, (walk + part[None, :]) * room + slot[:, None] - begins[None, :], 0), axis=1)
             k = tl.load(noted + at, mask=inside, other=0)
             low, middle, high = tl.load(lattice + k), tl.load(lattice + k + 1), tl.load(lattice + k + 2)

@@ -1,4 +1,4 @@
-"""What a march walks through: occupied cells, blocks of them, and how far each ray is."""
+"""What a march walks through: occupied cells, blocks of them, and the state of each ray."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,9 +13,9 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 BLOCK = 4
-"""Side of the blocks of cells that are skipped at once where all are empty."""
+"""Side of the blocks of cells that are skipped at once if all are empty."""
 FARTHEST = 8
-"""So many blocks on are skipped at once, at most."""
+"""Maximum number of blocks that are skipped at once."""
 
 
 @dataclass(frozen=True)
@@ -23,27 +23,27 @@ class OccupancyCells(TensorStruct):
     """Which cells may hold something."""
 
     aabb: Float[Tensor, "2 3"]
-    """The box that holds them."""
+    """The box that contains the cells."""
     cells: UInt8[Tensor, "x y z"]
     """1 where occupied."""
     leaps: UInt8[Tensor, "a b c"]
-    """What `leaps_over` says of each block of cells: how much around it is empty."""
+    """The result of `leaps_over` for each block of cells: how much around it is empty."""
 
     def in_box(self, rays: RayBundle) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-        """Return origins and directions in coordinates of the box, which is the cube from -1 to 1."""
+        """Return origins and directions in coordinates where the box is the cube from -1 to 1."""
         center, half = center_and_half(self.aabb)
         return (rays.origins - center) / half, rays.directions / half
 
 
 def blocks_of(cells: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "a b c"]:
-    """Return which blocks of cells hold an occupied one; the grid's side is a multiple of 4."""
+    """Return which blocks contain an occupied cell; the grid's side must be a multiple of 4."""
     return functional.max_pool3d(cells.float()[None], BLOCK)[0].to(torch.uint8)
 
 
 def leaps_over(blocks: UInt8[Tensor, "a b c"]) -> UInt8[Tensor, "a b c"]:
-    """Return how far from each block the next occupied one is, in blocks along the axis where it is farthest.
+    """Return the Chebyshev distance from each block to the nearest occupied one, in blocks.
 
-    0 for a block that is occupied, 1 for a neighbor, `FARTHEST` at most.
+    0 for an occupied block, 1 for a neighbor, at most `FARTHEST`.
     """
     reached = blocks.float()[None]
     leaps = torch.zeros_like(reached)
@@ -55,15 +55,15 @@ def leaps_over(blocks: UInt8[Tensor, "a b c"]) -> UInt8[Tensor, "a b c"]:
 
 @dataclass(frozen=True)
 class MarchState(TensorStruct):
-    """Where each ray's march stands: rays may be marched a few samples at a time."""
+    """The state of each ray's march: rays may be marched a few samples at a time."""
 
     enter: Float[Tensor, "rays"]
-    """Distances between which samples are wanted."""
+    """Distances between which samples are taken."""
     leave: Float[Tensor, "rays"]
     jitter: Float[Tensor, "rays"]
     """In [0, 1)."""
     next: Int[Tensor, "rays"]
-    """The lattice interval to go on with."""
+    """The lattice interval to continue with."""
 
 
 class GridMarch(NamedTuple):

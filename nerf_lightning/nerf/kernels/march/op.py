@@ -1,7 +1,7 @@
-"""March along rays through a grid of occupied cells, and keep the intervals whose middle lies in one.
+"""March along rays through a grid of occupied cells, and keep the intervals whose middle is in one.
 
 The intervals of all rays come from one lattice of distances: interval k of a ray begins at
-e[k] + jitter (e[k+1] - e[k]). Cascade c of the grid is the box, enlarged 2^c times about its center.
+e[k] + jitter (e[k+1] - e[k]).
 """
 
 from jaxtyping import Float, Int
@@ -20,16 +20,16 @@ def march(
     limit: int | None = None,
     capacity: int | None = None,
 ) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
-    """Return the occupied intervals, at most `limit` per ray, and where each ray would go on.
+    """Return the occupied intervals, at most `limit` per ray, and where each ray would continue.
 
     Args:
         rays: unit directions.
-        state: bounds, jitter and place of each ray.
+        state: bounds, jitter and position of each ray.
         lattice: increasing distances; two more than there are intervals.
-        grid: what is occupied.
-        limit: most samples of a ray; None for all.
-        capacity: size of the arrays returned, read nowhere on the host, and what does not fit is dropped from the
-            last rays; None for as many as there are.
+        grid: the occupied cells.
+        limit: maximum number of samples per ray; None for all.
+        capacity: size of the returned arrays, so that no size is read on the host; what does not fit is dropped from
+            the last rays. None: as many as there are.
     """
     backend = cpu_backend("march.cpu", rays.near.device)
     if backend is not None and capacity is None:

@@ -17,7 +17,7 @@ def march_torch(
     limit: int | None,
     capacity: int | None,
 ) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
-    """Return the occupied intervals and where each ray would go on."""
+    """Return the occupied intervals and where each ray would continue."""
     keep, edges = occupied_intervals(rays, state, lattice, grid)
     number = torch.arange(keep.shape[1], device=edges.device)
     following = torch.full_like(state.next, number.numel())
@@ -32,9 +32,9 @@ def march_torch(
 def occupied_intervals(
     rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells
 ) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
-    """Return which intervals of each ray may hold something, and return the fenceposts of all.
+    """Return which intervals of each ray may hold something, and the fenceposts of all.
 
-    The shapes are the same whatever the grid holds.
+    The shapes do not depend on the grid's content.
     """
     edges = lattice[:-1] + state.jitter[:, None] * (lattice[1:] - lattice[:-1])
     midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
@@ -44,7 +44,7 @@ def occupied_intervals(
 
 
 def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
-    """Return which positions lie in an occupied cell."""
+    """Return which positions are in an occupied cell."""
     resolution = grid.cells.shape[0]
     center, half = center_and_half(grid.aabb)
     scaled = (positions - center) / half

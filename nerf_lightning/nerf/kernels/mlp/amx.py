@@ -1,9 +1,9 @@
-"""Products of bfloat16 matrices by AMX: tiles of 16 rows of 64 bytes, on Intel's servers since Sapphire Rapids.
+"""Products of bfloat16 matrices with AMX: tiles of 16 rows of 64 bytes, on Intel servers since Sapphire Rapids.
 
-One instruction multiplies two tiles: 8,192 products, where one of AVX512-BF16 has 32. The sums are float32. Linux lets
-a process use the tiles once it has asked, which torch does.
+One instruction multiplies two tiles: 8,192 products, where one of AVX512-BF16 has 32. Sums are float32. Linux lets a
+process use the tiles once it has requested them, which torch does.
 
-Addresses and words are those of `vectors.py`.
+Addresses and words are as in `vectors.py`.
 """
 
 import struct
@@ -19,25 +19,25 @@ from numba.extending import intrinsic
 from nerf_lightning.nerf.kernels.mlp.vectors import ADDRESS, WORDS, pointer_to
 
 KIND = np.int64(0)
-"""Tells the kernels that words hold two bfloat16 numbers, and that tiles multiply them."""
+"""The kind of words that hold two bfloat16 numbers and are multiplied by tiles."""
 TILE = 16
 """Rows of a tile, and words of each."""
-# Palette 1; from byte 16 on how many bytes the rows of each of the eight tiles have, from byte 48 on how many rows.
+# Palette 1; from byte 16 on, the bytes per row of each of the eight tiles; from byte 48 on, the number of rows.
 CONFIG = struct.pack("<BB14x8H16x8B8x", 1, 0, *[64] * 8, *[TILE] * 8)
 # Tiles 0 to 3 hold sums, 4 and 5 rows of x, 6 and 7 columns of w.
 X, W = 4, 6
 
 
 def is_allowed() -> bool:
-    """Return whether this process may use the tiles; it asks for them."""
+    """Request the tiles, and return whether this process may use them."""
     try:
         return sys.platform == "linux" and bool(torch.cpu._init_amx())
-    except (AttributeError, RuntimeError):  # an older torch, or a CPU that it does not know
+    except (AttributeError, RuntimeError):  # an older torch, or a CPU unknown to it
         return False
 
 
 def _say(builder: Any, text: str, *operands: Any) -> None:
-    """Write an instruction out; it may read and write memory, and stays in its place among those that do."""
+    """Emit an instruction that may read and write memory, and is not reordered among others that do."""
     kind = ir.FunctionType(ir.VoidType(), [each.type for each in operands])
     constraints = ",".join(["r"] * len(operands) + ["~{memory}"])
     builder.call(ir.InlineAsm(kind, text, constraints, side_effect=True), operands)
@@ -55,7 +55,7 @@ def is_tiled(context: Any, kind: Any) -> Any:
 
 @intrinsic
 def open_tiles(context: Any, kind: Any) -> Any:
-    """Set the shape of this thread's tiles."""
+    """Configure this thread's tiles."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if kind == types.int64:
@@ -69,7 +69,7 @@ def open_tiles(context: Any, kind: Any) -> Any:
 
 @intrinsic
 def close_tiles(context: Any, kind: Any) -> Any:
-    """Give this thread's tiles back, which others shape in other ways."""
+    """Release this thread's tiles, which other code configures differently."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if kind == types.int64:
@@ -84,9 +84,9 @@ def multiply_tiles(
     context: Any, kind: Any, rows: Any, columns: Any, x: Any, next_row: Any, w: Any, y: Any, row: Any, words: Any,
     adds: Any,
 ) -> Any:  # fmt: skip
-    """y[r, c] = sum over k of x[r, k] w[k, c], as `vectors.multiply_block`, for tiles of rows and columns: literals.
+    """y[r, c] = sum over k of x[r, k] w[k, c], as `vectors.multiply_block`, for literal `rows` x `columns` tiles.
 
-    The words of a row of x follow one another, and their number is a multiple of 16.
+    The words of a row of x are contiguous, and their number is a multiple of 16.
     """
     across, down = range(columns.literal_value), range(rows.literal_value)
 
@@ -124,7 +124,7 @@ def multiply_tiles(
 
 @intrinsic
 def turn_words(context: Any, source: Any, next_source: Any, target: Any, next_target: Any) -> Any:
-    """Write the transpose of 16 rows of 16 words; their rows are some bytes apart."""
+    """Write the transpose of 16 rows of 16 words; the rows may be any number of bytes apart."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         source, next_source, target, next_target = arguments
@@ -133,7 +133,7 @@ def turn_words(context: Any, source: Any, next_source: Any, target: Any, next_ta
             return pointer_to(builder, builder.add(address, builder.mul(stride, stride.type(r))), WORDS)
 
         rows = [builder.load(row(source, next_source, r), align=4) for r in range(TILE)]
-        for step in (1, 2, 4, 8):  # blocks of this many rows and words change places across the diagonal
+        for step in (1, 2, 4, 8):  # swap blocks of this many rows and words across the diagonal
             kept = [lane if not lane & step else lane - step + TILE for lane in range(TILE)]
             moved = [lane + step if not lane & step else lane + TILE for lane in range(TILE)]
             for r in range(TILE):

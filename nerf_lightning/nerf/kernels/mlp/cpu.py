@@ -1,10 +1,10 @@
-"""The perceptron for the CPU: a few rows at a time go through all layers, in the cache.
+"""The MLP for the CPU: a few rows at a time go through all layers, in the cache.
 
-What is lost elsewhere is not arithmetic but the way between layers: a framework writes, casts and reads again what here
-stays in 128 rows of activations. Products are of float32 numbers, or, on CPUs with AVX512-BF16, of bfloat16 ones and
-exact; the weights' dtype says which. Sums are float32. Where there are AMX's tiles, they multiply the bfloat16 ones.
+The time is usually lost not in arithmetic but between layers: a framework writes, casts and rereads what stays here in
+128 rows of activations. Products are of float32 numbers or, on CPUs with AVX512-BF16, exact ones of bfloat16 numbers,
+depending on the weights' dtype. Sums are float32. With AMX, tiles multiply the bfloat16 numbers.
 
-The last layer's width is padded to whole vectors. Words and kinds are those of `vectors.py` and `amx.py`.
+The last layer's width is padded to whole vectors. Words and kinds are as in `vectors.py` and `amx.py`.
 """
 
 from collections.abc import Sequence
@@ -33,43 +33,43 @@ from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16, tiles_of_rows
 
 ROWS = 128
-"""So many go through all layers together."""
+"""Number of rows that go through all layers together."""
 CPU = {} if numba.config.CPU_NAME else llvm.get_host_cpu_features()  # type: ignore[attr-defined]
-"""What LLVM knows of this CPU; nothing where numba is told to compile for another."""
+"""LLVM's features of this CPU; empty if numba is set to compile for another."""
 KINDS: dict[torch.dtype, Any] = {
     torch.float32: np.float32(0),
     torch.bfloat16: amx.KIND if CPU.get("amx-bf16") and amx.is_allowed() else np.int32(0),
 }
-"""What tells the kernels of which numbers words are made, and what multiplies them."""
+"""The kind that selects, for each dtype, the numbers in a word and the instructions that multiply them."""
 WIDE = bool(CPU.get("avx512f"))
-"""Whether there are 32 registers of a whole vector each."""
+"""Whether there are 32 full-width vector registers."""
 
 
 def takes(weights: Sequence[Tensor], dtype: torch.dtype, pads: bool = False) -> bool:
-    """Return whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors.
+    """Return whether the kernels support an MLP with products of a dtype: its inputs must be whole vectors.
 
     Args:
-        weights: of all layers.
+        weights: weights of all layers.
         dtype: float32 or bfloat16.
-        pads: whether whoever calls fills the first layer's inputs up with zeros.
+        pads: whether the caller pads the first layer's inputs with zeros.
     """
     return dtype in dtypes() and all(weight.shape[1] % LANES == 0 for weight in weights[1 if pads else 0 :])
 
 
 def dtypes() -> list[torch.dtype]:
-    """Return which numbers are multiplied here: bfloat16 where LLVM, too, knows of this CPU's instructions.
+    """Return the supported dtypes of products: bfloat16 only if LLVM, too, knows this CPU's instructions.
 
-    Where it does not, it would end the program.
+    If it does not, it would abort the program.
     """
     return [torch.float32, torch.bfloat16] if CPU.get("avx512bf16") and cpu_multiplies_bfloat16() else [torch.float32]
 
 
 def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, Tensor]:
-    """Return the outputs, and the inputs of all layers where they are to be kept.
+    """Return the outputs, and the inputs of all layers if they are kept.
 
     Args:
         points: inputs of the first layer.
-        weights: float32 or bfloat16, as their products are wanted.
+        weights: float32 or bfloat16, the dtype of the products.
         keep: whether a backward pass follows.
     """
     points, widths, kind = points.float().contiguous(), padded_widths(weights), KINDS[weights[0].dtype]
@@ -104,7 +104,7 @@ def backward(
 
 
 def unpadded(total: Tensor, weights: Sequence[Tensor], widths: Sequence[int]) -> list[Tensor]:
-    """Return the gradients of all layers' weights, which lie one after the other, without what was padded."""
+    """Return the gradients of all layers' weights from one flat array, without padding."""
     grads, offset = [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         of_layer = total[offset : offset + inner * outer].view(outer, inner)
@@ -114,9 +114,9 @@ def unpadded(total: Tensor, weights: Sequence[Tensor], widths: Sequence[int]) ->
 
 
 def trial() -> None:
-    """Run the forward kernel once on next to nothing; it raises whatever its compiler raises.
+    """Run the forward kernel once on tiny input; it raises whatever the compiler raises.
 
-    Few trainings need the backward one, for kernels of whole rays have their own.
+    Few trainings need the backward one, since whole-ray kernels have their own.
     """
     points, weights = torch.ones(3, 16), [torch.ones(16, 16), torch.ones(3, 16)]
     for dtype in dtypes():
@@ -124,18 +124,18 @@ def trial() -> None:
 
 
 def padded_widths(weights: Sequence[Tensor]) -> list[int]:
-    """Return the widths of all layers' inputs and of what comes out, in whole vectors."""
+    """Return the widths of all layers' inputs and of the output, padded to whole vectors."""
     widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
     return [-(-width // LANES) * LANES for width in widths]
 
 
 def words_of(numbers: int, dtype: torch.dtype) -> int:
-    """Return how many words so many numbers take."""
+    """Return how many words `numbers` numbers take."""
     return numbers // 2 if dtype == torch.bfloat16 else numbers
 
 
 def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
-    """Return the words of all layers: rows of W^T, or of W, one layer after the other; in bfloat16 pairs of rows."""
+    """Return the words of all layers: rows of W^T, or of W, layer by layer; in bfloat16, pairs of rows."""
     out, offset = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights[0].dtype), np.int32), 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         padded = np.zeros((outer, inner), np.float32)
@@ -153,14 +153,14 @@ def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: b
 @njit
 @no_type_check
 def address(array):
-    """Return where an array lies. It lives only as long as its name is used: ask for this in the loop that needs it."""
+    """Return an array's address. The array lives only while its name is in use: call this in the loop that needs it."""
     return np.int64(array.ctypes.data)
 
 
 @njit
 @no_type_check
 def _multiply(kind, x, next_row, next_word, w, y, width, rows, words, adds):
-    # All rows of y, which are `width` numbers long, as w's are. As many sums at once as the registers hold.
+    # All rows of y, `width` numbers long, like those of w. As many sums at once as fit into the registers.
     row, column = 4 * width, 0
     if is_tiled(kind) and next_word == 4 and words % TILE == 0:
         _multiply_by_tiles(kind, x, next_row, w, y, width, rows, words, adds)
@@ -222,7 +222,7 @@ def _pack(rows, out):
 @njit
 @no_type_check
 def round_rows(kind, source, next_source, target, next_target, rows, width):
-    """Round rows of float32 to numbers of a kind."""
+    """Round rows of float32 numbers to a kind."""
     size = bytes_of(kind)
     for r in range(rows):
         for c in range(0, width, 16):
@@ -251,7 +251,7 @@ def _pass_back(kind, sums, width, inputs, next_input, target):
 @njit
 @no_type_check
 def _stack_rows(kind, source, next_row, width, target):
-    # Rows one after the other, as words that a product sums over.
+    # Contiguous rows, as words that a product sums over.
     if bytes_of(kind) == 4:
         round_rows(kind, source, next_row, target, 4 * width, ROWS, width)
         return
@@ -273,10 +273,10 @@ def _turn(source, rows, width, target):
 @njit
 @no_type_check
 def through(kind, x, w, dims, y, into):
-    """Send ROWS rows through all layers, and the end to `into`; at x there is room for all layers' inputs.
+    """Send ROWS rows through all layers, and write the output to `into`; x has room for all layers' inputs.
 
-    First come all rows of the first layer's inputs, which are there, then those of the second's, and so on: so memory
-    is written from its beginning to its end.
+    All rows of the first layer's inputs, which are given, are followed by those of the second's, and so on, so that
+    memory is written from beginning to end.
     """
     layers, size = len(dims) - 1, bytes_of(kind)
     open_tiles(kind)
@@ -296,17 +296,17 @@ def back_through(kind, x, w, dims, dy, y, upper, lower, total, wants_inputs, int
     """Send gradients of ROWS rows back through all layers.
 
     Args:
-        kind: of the words.
-        x: address of what `through` has left of all layers' inputs.
+        kind: kind of the words.
+        x: address of all layers' inputs, as `through` left them.
         w: address of all layers' words, transposed.
-        dims: widths of all layers' inputs, and of what comes out.
-        dy: address of the gradients of what came out, numbers of the kind; there is room for the widest layer's, too.
+        dims: widths of all layers' inputs, and of the output.
+        dy: address of the gradients of the output, numbers of the kind, with room for the widest layer's.
         y: address of room for the sums.
         upper: address of room for numbers of the kind.
-        lower: address of room for as many.
-        total: address of the gradients of the weights, which are added to.
-        wants_inputs: whether the gradients of the inputs are wanted, in float32.
-        into: where.
+        lower: the same, for as many.
+        total: address of the gradients of the weights, which are accumulated.
+        wants_inputs: whether to compute the gradients of the inputs, in float32.
+        into: where to write them.
     """
     size, before, numbers = bytes_of(kind), 0, 0
     open_tiles(kind)
@@ -317,7 +317,7 @@ def back_through(kind, x, w, dims, dy, y, upper, lower, total, wants_inputs, int
         before, numbers = before - inner, numbers - inner * outer
         inputs, words = x + ROWS * size * before, w + size * numbers
         # dW[o, i] = sum over rows of dy[row, o] x[row, i]
-        if is_tiled(kind):  # which want what is summed over side by side
+        if is_tiled(kind):  # tiles need the summed dimension contiguous
             _stack_rows(kind, dy, size * outer, outer, lower)
             _turn(lower, ROWS * size // 4, outer, upper)
             next_row, next_word = ROWS * size, 4
@@ -346,7 +346,7 @@ def _forward(kind, first, last, keep, points, packed, dims, out, kept):
         count = min(ROWS, last - start)
         x = address(kept) + start * stride if keep else address(own)
         if keep and count < ROWS:
-            kept[start : start + ROWS] = 0  # the sums of the way back go over whole blocks
+            kept[start : start + ROWS] = 0  # the backward pass sums over whole blocks
         round_rows(
             kind, address(points) + 4 * start * dims[0], 4 * dims[0], x, bytes_of(kind) * dims[0], count, dims[0]
         )

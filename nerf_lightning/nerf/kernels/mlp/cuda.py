@@ -1,7 +1,7 @@
-"""The perceptron in bfloat16 for CUDA: a block of rows goes through all layers without leaving the registers.
+"""The MLP in bfloat16 for CUDA: a block of rows goes through all layers without leaving the registers.
 
-A framework writes and reads the activations of each layer; here only what the way back needs is written. Products are
-of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
+A framework writes and reads the activations of each layer; these kernels write only what the backward pass needs.
+Products are of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
 import functools
@@ -23,25 +23,25 @@ log = logging.getLogger(__name__)
 
 BLOCK, BACKWARD_BLOCK = 128, 64
 FORWARD: dict[str, Any] = {"enable_fp_fusion": True}
-# A pipeline would keep the rows of several rounds in shared memory: 124 KiB for layers 32-64-64-3, where most GPUs have
-# 99. In one stage it is 16 to 32 KiB, and 64 for layers of 128. Of larger blocks and fewer warps most sums would not
-# fit into the registers.
+# A pipeline would keep the rows of several iterations in shared memory: 124 KiB for layers 32-64-64-3, where most GPUs
+# have 99. With one stage it is 16 to 32 KiB, and 64 for layers of 128. With larger blocks and fewer warps most sums
+# would not fit into the registers.
 # With 4 warps the code of Triton 3.6 ends in an illegal memory access on an H100 (triton-lang/triton, issue 11366).
 BACKWARD: dict[str, Any] = {"enable_fp_fusion": True, "num_stages": 1, "num_warps": 8}
 PROGRAMS = 4
-"""For each multiprocessor: each sums up gradients of the weights for itself, and the order of all sums is fixed. On an
+"""Programs per multiprocessor: each sums gradients of the weights separately, and the order of all sums is fixed. On an
 H100 four take two thirds of the time of two."""
 ELSEWHERE = 64
-"""Multiprocessors that the interpreter makes believe."""
+"""Number of multiprocessors assumed in the interpreter."""
 NARROWEST, WIDEST = 16, 128
 LAYERS = (2, 3)
 INTERPRETED = triton.knobs.runtime.interpret
-"""Triton's interpreter multiplies no bfloat16 numbers."""
+"""Triton's interpreter cannot multiply bfloat16 numbers."""
 
 
 @functools.cache
 def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
-    """Return whether the kernels run here for a perceptron of these widths, from inputs to outputs; tried once."""
+    """Return whether the kernels run here for an MLP of these widths, from inputs to outputs; tried once."""
     if len(sizes) - 1 not in LAYERS or max(sizes) > WIDEST:
         return False
     try:
@@ -65,9 +65,9 @@ def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
 def forward(
     points: Float[Tensor, "points in"], weights: Sequence[Tensor], keep: bool, used: Int[Tensor, "1"] | None = None
 ) -> tuple[Float[Tensor, "points out"], BFloat16[Tensor, "kept words"]]:
-    """Return the outputs, and the inputs of all layers where they are to be kept; zeros from row `used` on.
+    """Return the outputs, and the inputs of all layers if they are kept; zeros from row `used` on.
 
-    Up to a block: a program whose rows are all padding computes nothing.
+    Rounded up to a block: a program whose rows are all padding computes nothing.
     """
     widths, rows = _padded_widths(weights), points.shape[0]
     out = torch.empty(rows, weights[-1].shape[0], device=points.device)
@@ -103,10 +103,10 @@ def backward(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises.
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises.
 
     Raises:
-        RuntimeError: it multiplies wrongly; all numbers here are powers of two, or three times one, and so exact.
+        RuntimeError: a product is wrong; all numbers here are powers of two, or three times one, and thus exact.
     """
     for hidden in range(1, max(LAYERS)):
         points, count = torch.ones(3, 16, device=device), 16.0**hidden
@@ -127,18 +127,18 @@ def _multiprocessors(device: torch.device) -> int:
 
 
 def _padded_widths(weights: Sequence[Tensor]) -> list[int]:
-    """Return the widths of all layers' inputs and of what comes out, in sizes that tensor cores take."""
+    """Return the widths of all layers' inputs and of the output, padded to sizes that tensor cores support."""
     widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
     return [max(NARROWEST, triton.next_power_of_2(width)) for width in widths]
 
 
 def _three(weights: Sequence[Tensor]) -> list[Tensor]:
-    """Return as many weights as the kernels take; they do not look at the last one of two."""
+    """Return three weights, as the kernels expect; with two layers they ignore the last one."""
     return [each.contiguous() for each in (*weights, weights[-1])[:3]]
 
 
 def _sizes(weights: Sequence[Tensor], widths: Sequence[int]) -> tuple[int, ...]:
-    """Return the four widths of the layers as they are, and as they are padded; the last ones of two layers twice."""
+    """Return the layers' four widths, unpadded and padded; with two layers the last is repeated."""
     given = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
     return *(*given, given[-1])[:4], *(*widths, widths[-1])[:4]
 
@@ -163,7 +163,7 @@ def _weights(weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexp
 @triton.jit
 @no_type_check
 def _rows(array, row, count, width: tl.constexpr, padded: tl.constexpr):
-    """Return some rows of `width` numbers as bfloat16, with zeros beside and below them."""
+    """Return some rows of `width` numbers as bfloat16, zero-padded on the right and below."""
     column = tl.arange(0, padded)
     there = (row < count)[:, None] & (column < width)[None, :]
     return tl.load(array + row[:, None] * width + column[None, :], mask=there, other=0.0).to(tl.bfloat16)
@@ -224,7 +224,7 @@ def _passed_back(
     flowing, x, weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr,
     widen: tl.constexpr,
 ):  # fmt: skip
-    """Return the gradient of a layer's inputs x before their ReLU."""
+    """Return the gradient of a layer's inputs x, before their ReLU."""
     sums = _multiply(flowing, _weights(weight, n_in, n_out, inner, outer), widen)
     return tl.where(x.to(tl.float32) > 0.0, sums, 0.0).to(tl.bfloat16)
 
@@ -268,7 +268,7 @@ def _backward(
             into = of_points + row[:, None] * n0 + column[None, :]
             tl.store(into, _multiply(flowing, _weights(w0, n0, n1, d0, d1), widen), mask=there)
     if used is not None and wants_points:
-        # What flows back from padding.
+        # The gradient of padding.
         column = tl.arange(0, d0)[None, :]
         first = (last + block - 1) // block * block
         for start in range(first + tl.program_id(0) * block, count, tl.num_programs(0) * block):

@@ -1,6 +1,6 @@
 """Small multilayer perceptrons without biases: matrix products with ReLU between them.
 
-At widths of 64 a general framework spends as much on moving activations through memory as on arithmetic. On the CPU
+At widths of 64, a general framework spends as much time moving activations through memory as on arithmetic. On the CPU
 each core takes tiles of rows through all layers, forward and backward, so that they stay in its cache; on CUDA a block
 of rows stays in registers.
 """
@@ -27,9 +27,9 @@ def mlp(
 
     Args:
         points: the inputs.
-        weights: of each layer.
-        matmul_precision: of the products.
-        used: on CUDA, the row from which on all is padding: kernels do not compute it, and no gradient comes from it.
+        weights: weight of each layer.
+        matmul_precision: precision of the products.
+        used: on CUDA, the index from which all rows are padding: kernels skip it, and it has no gradients.
     """
     found = _kernels_for(points, weights, matmul_precision)
     if found is None:
@@ -44,7 +44,7 @@ def mlp(
 def mlp_torch(
     points: Float[Tensor, "points in"], weights: list[Tensor], matmul_precision: MatmulPrecision = "float32"
 ) -> Float[Tensor, "points out"]:
-    """Return the same in plain torch: the reference, and what runs where there are no kernels."""
+    """Return the same in plain torch: the reference, and the fallback without kernels."""
     for weight in weights[:-1]:
         points = linear(points, weight, None, matmul_precision).relu_()
     return linear(points, weights[-1], None, matmul_precision)
@@ -53,7 +53,7 @@ def mlp_torch(
 def _kernels_for(
     points: Tensor, weights: list[Tensor], matmul_precision: MatmulPrecision
 ) -> tuple[ModuleType, torch.dtype] | None:
-    """Return the device's kernels, and what they take the weights in."""
+    """Return the device's kernels, and the dtype in which they take the weights."""
     if points.dtype == torch.float64:
         return None
     if points.is_cuda:

@@ -1,4 +1,4 @@
-"""The perceptron for the CPU: tiles of rows, one thread of ours for each of torch's, none of torch's own.
+"""The MLP for the CPU: tiles of rows, on our own threads instead of torch's, as many as torch has.
 
 The tiles and the order of their sums are fixed, so the result does not depend on the number of threads.
 """
@@ -17,7 +17,7 @@ relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input,
 
 @disable_autocast
 def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, list[list[Tensor]]]:
-    """Return the outputs in float32, and each tile's inputs of every layer where they are to be kept."""
+    """Return the outputs in float32, and each tile's inputs of every layer if they are kept."""
     out = points.new_empty(points.shape[0], weights[-1].shape[0])
 
     def tile(rows: slice) -> list[Tensor]:

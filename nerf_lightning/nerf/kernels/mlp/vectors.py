@@ -1,11 +1,11 @@
-"""Vectors of 16 numbers for numba: products, and what lies between layers, in float32 or bfloat16.
+"""Vectors of 16 numbers for numba: products, and the operations between layers, in float32 or bfloat16.
 
-LLVM is told of vectors, and makes of them what the CPU has; so no compiler is needed. In bfloat16 it is handed the
-instructions of AVX512-BF16 as they are, and a CPU without them must not come here.
+LLVM lowers the vectors to what the CPU has, so no compiler is needed. For bfloat16 it is given the instructions of
+AVX512-BF16 directly, which the CPU must support.
 
-Addresses are whole numbers of bytes. A word has four bytes: one float32, or two bfloat16 numbers, the first in its
-lower half. The first argument of most functions, `kind`, is a number of numba's type for words of float32
-(np.float32(0)) or of bfloat16 (np.int32(0)): by its type alone one of two codes is chosen.
+Addresses are integers, in bytes. A word has four bytes: one float32, or two bfloat16 numbers, the first in its lower
+half. The first argument of most functions, `kind`, is a number of numba's type for words of float32 (np.float32(0)) or
+of bfloat16 (np.int32(0)): its type alone selects one of two implementations.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ ROUND = ("vcvtneps2bf16 $1, $0", "=v,v")
 
 
 def pointer_to(builder: Any, address: Any, kind: Any, byte: Any = None) -> Any:
-    """A pointer to what stands at an address, so many bytes on."""
+    """Return a pointer to an address, offset by `byte` bytes."""
     return builder.inttoptr(address if byte is None else builder.add(address, byte), kind.as_pointer())
 
 
@@ -45,7 +45,7 @@ def _is_bfloat16(kind: Any) -> bool:
 
 @intrinsic
 def bytes_of(context: Any, kind: Any) -> Any:
-    """Return how many bytes a number has."""
+    """Return the number of bytes of a number."""
     size = 2 if _is_bfloat16(kind) else 4
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -63,17 +63,17 @@ def multiply_block(
 
     Args:
         context: numba's.
-        kind: of the words.
-        rows: how many, a literal.
-        blocks: of 16 columns, a literal.
+        kind: kind of the words.
+        rows: number of rows, a literal.
+        blocks: number of blocks of 16 columns, a literal.
         x: address of words.
-        next_row: bytes from row to row of x.
-        next_word: bytes from word to word of x.
-        w: address of words, each of one column; in bfloat16 of two rows.
-        y: address of float32.
-        row: bytes from word to word of w, and from row to row of y.
-        words: how many are summed.
-        adds: 1 adds to what stands in y, 0 overwrites it.
+        next_row: bytes between rows of x.
+        next_word: bytes between words of x.
+        w: address of words, each of one column; in bfloat16, of two rows.
+        y: address of float32 numbers.
+        row: bytes between words of w, and between rows of y.
+        words: number of words that are summed.
+        adds: 1 adds to y, 0 overwrites it.
     """
     count, width, bfloat16 = rows.literal_value, blocks.literal_value, _is_bfloat16(kind)
     number, numbers = (WORD, WORDS) if bfloat16 else (FLOAT, FLOATS)
@@ -124,7 +124,7 @@ def multiply_block(
 
 
 def _write(builder: Any, kind: Any, numbers: Any, address: Any) -> None:
-    """Write 16 float32 as numbers of a kind."""
+    """Write 16 float32 numbers as numbers of a kind."""
     if _is_bfloat16(kind):
         rounded = builder.call(ir.InlineAsm(ir.FunctionType(HALVES, [FLOATS]), *ROUND), [numbers])
         builder.store(rounded, pointer_to(builder, address, HALVES), align=4)
@@ -134,7 +134,7 @@ def _write(builder: Any, kind: Any, numbers: Any, address: Any) -> None:
 
 @intrinsic
 def round_vector(context: Any, kind: Any, source: Any, target: Any) -> Any:
-    """Round 16 float32 to numbers of a kind."""
+    """Round 16 float32 numbers to a kind."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         _write(builder, kind, builder.load(pointer_to(builder, arguments[1], FLOATS), align=4), arguments[2])
@@ -145,12 +145,12 @@ def round_vector(context: Any, kind: Any, source: Any, target: Any) -> Any:
 
 @intrinsic
 def round_positive(context: Any, kind: Any, source: Any, target: Any) -> Any:
-    """Round 16 float32 to numbers of a kind, the negative ones to 0."""
+    """Round 16 float32 numbers to a kind, negative ones to 0."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         numbers = builder.load(pointer_to(builder, arguments[1], FLOATS), align=4)
         zeros = ir.Constant(FLOATS, [0.0] * LANES)
-        negative = builder.fcmp_ordered("<", numbers, zeros)  # what is not a number stays that
+        negative = builder.fcmp_ordered("<", numbers, zeros)  # NaN stays NaN
         _write(builder, kind, builder.select(negative, zeros, numbers), arguments[2])
         return context.get_dummy_value()
 
@@ -159,7 +159,7 @@ def round_positive(context: Any, kind: Any, source: Any, target: Any) -> Any:
 
 @intrinsic
 def round_where_on(context: Any, kind: Any, source: Any, active: Any, target: Any) -> Any:
-    """Round 16 float32 to numbers of a kind, those to 0 where 16 others of that kind are 0."""
+    """Round 16 float32 numbers to a kind, to 0 where 16 others of that kind are 0."""
     lanes = HALVES if _is_bfloat16(kind) else WORDS
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -174,7 +174,7 @@ def round_where_on(context: Any, kind: Any, source: Any, active: Any, target: An
 
 @intrinsic
 def pair_rows(context: Any, upper: Any, lower: Any, target: Any) -> Any:
-    """Write 16 words, each a number of one row and that below it, from 16 bfloat16 numbers of each."""
+    """Write 16 words, each a number of one row and the one below it, from 16 bfloat16 numbers of each row."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = [builder.load(pointer_to(builder, address, HALVES), align=4) for address in arguments[:2]]

@@ -1,4 +1,4 @@
-"""Batches of pixels for CUDA in one kernel: which pixels, in keyed order, and what they show.
+"""Batches of pixels for CUDA in one kernel: which pixels, in keyed order, and their content.
 
 It is `RayBatches.at` for single pixels, bit for bit. `TRITON_INTERPRET=1` runs it without a GPU.
 """
@@ -16,7 +16,7 @@ from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
 
 BLOCK = 64
-"""Few, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
+"""Small, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
 
 
 def batch(
@@ -43,10 +43,10 @@ def batch(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises.
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises.
 
     Raises:
-        RuntimeError: they compute wrongly.
+        RuntimeError: the result is wrong.
     """
     ends, views = torch.tensor([[4, 8], [0, 1]], device=device)  # two pictures of 2 x 2
     domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
@@ -60,7 +60,7 @@ def trial(device: str = "cuda") -> None:
 
 
 VARIES = ["several", "first", "key", "count", "known_first", "known_key"]
-"""From step to step: no reason to compile again."""
+"""Arguments that vary between steps, without recompiling."""
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -97,7 +97,7 @@ def _batch(
                 row = (row + mix(word ^ column.to(tl.uint32)).to(tl.int64)) % rows
         number = tl.where(walks, row * columns + column, number)
         walks = walks & (number >= size)
-    # Of the pixels of a domain: how many views end before each, by halving what is left.
+    # Pixels of a domain: how many views end before each, by bisection.
     numbered = valid & ~is_known
     low, high = tl.zeros([block], tl.int32), tl.full([block], slots, tl.int32)
     for _ in range(steps):
@@ -119,7 +119,7 @@ def _batch(
     tl.store(out_view + index, view, mask=valid)
     tl.store(out_x + index, x, mask=valid)
     tl.store(out_y + index, y, mask=valid)
-    # What they show.
+    # The pixels' content.
     flat = tl.load(offset + view, mask=valid, other=0) + y * tl.load(width + view, mask=valid, other=0) + x
     channel, inside = tl.arange(0, 4)[None, :], valid[:, None]
     color = tl.load(rgba + 4 * flat[:, None] + channel, mask=inside, other=0).to(tl.float32)

@@ -1,4 +1,4 @@
-"""Batches of pixels in one kernel, where there is one; the reference is `data.ray_batches.RayBatches.at`."""
+"""Batches of pixels in one kernel, if there is one; the reference is `data.ray_batches.RayBatches.at`."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from nerf_lightning.nerf.types.scene import PixelStore
 
 
 class Order(NamedTuple):
-    """Places in a row of things that follow each other anew in each epoch."""
+    """A range of places in a sequence that is reshuffled in each epoch."""
 
     places: range
     size: int
-    """Of an epoch, whose order is `randomness.permute` with the key `fold(*parts, epoch)`."""
+    """Size of an epoch, whose order is `randomness.permute` with the key `fold(*parts, epoch)`."""
     key: int
     """fold(*parts)."""
 
@@ -27,35 +27,35 @@ class Domain(NamedTuple):
     ends: Int[Tensor, "views"]
     """The number that follows each view's last pixel."""
     columns: Int[Tensor, "views"]
-    """Pixels in a row of each view that are numbered."""
+    """Numbered pixels per row of each view."""
     views: Int[Tensor, "views"]
-    """Which view each is."""
+    """The view of each."""
     left: Int[Tensor, "views"]
-    """Column of its first numbered pixel."""
+    """Column of each view's first numbered pixel."""
     top: Int[Tensor, "views"]
-    """Row of it."""
+    """Row of that pixel."""
 
 
 NOWHERE = Order(range(0), 1, 0)
 
 
 def has_kernel(device: torch.device) -> bool:
-    """Return whether there is a kernel on a device."""
+    """Return whether there is a kernel for a device."""
     return cuda_backend("pixels.cuda", device) is not None
 
 
 def ordered_batch(
     rays: Order, domain: Domain, store: PixelStore, known: KnownDepths | None = None, of_known: Order = NOWHERE
 ) -> Batch:
-    """Return the pixels at some places of the order of a domain, then those at some places of all of known distance.
+    """Return pixels at some places in the order of a domain, then some of those of known distance.
 
-    Where `has_kernel` says so.
+    Requires `has_kernel`.
 
     Args:
         rays: places in the domain.
-        domain: what is numbered.
+        domain: the numbered pixels.
         store: all pixels.
-        known: those whose distance is known; None: no distances are asked for.
+        known: pixels whose distance is known; None: no distances are needed.
         of_known: places among them.
     """
     kernels = cuda_backend("pixels.cuda", domain.ends.device)

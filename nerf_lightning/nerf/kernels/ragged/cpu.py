@@ -47,7 +47,7 @@ def integrate_gradient(
 
 
 def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
-    """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
+    """Return how many samples of each ray begin where the transmittance exceeds `opaque_below`."""
     out = torch.empty_like(samples.bounds[1:])
     arrays = (density.detach().contiguous(), samples.starts, samples.ends, samples.bounds, out)
     most = np.float32(-math.log(opaque_below))
@@ -56,7 +56,7 @@ def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_belo
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     bounds, along = torch.tensor([0, 2]), torch.arange(2.0)
     samples = RaggedSamples(torch.zeros(2, dtype=torch.long), along, along + 1.0, bounds, bounds[-1])
     density, rgb = torch.ones(2), torch.ones(2, 3)
@@ -94,7 +94,7 @@ def _gradient(
         optical = np.float32(0.0)
         for i in range(bounds[r], bounds[r + 1]):
             optical += density[i] * (ends[i] - starts[i])
-            d_density[i] = math.exp(-optical)  # kept for the way back: T_{i+1}
+            d_density[i] = math.exp(-optical)  # kept for the reverse loop: T_{i+1}
         behind = np.float32(0.0)
         for i in range(bounds[r + 1] - 1, bounds[r] - 1, -1):
             w, delta = weights[i], ends[i] - starts[i]

@@ -1,7 +1,7 @@
-"""Volume rendering for CUDA: a program sums along a ray, 32 samples at a time.
+"""Volume rendering for CUDA: a program sums along one ray, 32 samples at a time.
 
-Where all rays have equally many samples, `starts` and `ends` are views of their fenceposts, and there are no bounds.
-Letters as in `kernels.ragged.op`. Sums along a ray have a fixed order, so the results are the same in each run.
+If all rays have the same number of samples, `starts` and `ends` are views of their fenceposts, and there are no bounds.
+Letters as in `kernels.ragged.op`. Sums along a ray have a fixed order, so results are deterministic.
 `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
@@ -32,11 +32,11 @@ def integrate(
     Args:
         density: per unit length.
         rgb: in [0, 1].
-        starts: where each interval begins; of rays with as many samples each, all fenceposts.
-        ends: where it ends; the same from the second on.
+        starts: where each interval begins; for rays with the same number of samples, all fenceposts.
+        ends: where it ends; for such rays, the fenceposts from the second on.
         bounds: the samples of ray r are those from bounds[r] to bounds[r + 1].
-        each: samples of every ray, where there are no bounds; 0: as the bounds say.
-        closed: whether the last sample of a ray takes all the light that is left.
+        each: samples per ray, if there are no bounds; 0: as the bounds say.
+        closed: whether the last sample of a ray absorbs all remaining light.
     """
     capacity = density.shape[0]
     rays = capacity // each if each else bounds.shape[0] - 1
@@ -62,7 +62,7 @@ def integrate_gradient(
     each: int = 0,
     closed: bool = False,
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Return the gradients of density and color, given those of the four results."""
+    """Return the gradients of density and color, given those of the four outputs."""
     of_density, of_rgb = torch.empty_like(density), torch.empty_like(rgb)
     capacity = density.shape[0]
     rays = capacity // each if each else bounds.shape[0] - 1
@@ -73,7 +73,7 @@ def integrate_gradient(
 
 
 def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
-    """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
+    """Return how many samples of each ray begin where the transmittance exceeds `opaque_below`."""
     counts = torch.empty_like(samples.bounds[1:])
     if counts.numel():
         arrays = density.contiguous(), samples.starts, samples.ends, samples.bounds, counts
@@ -102,7 +102,7 @@ def first_of_each_ray(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     one, bounds = torch.ones(2, device=device), torch.tensor([0, 1, 2], device=device)
     given = one, torch.ones(2, 3, device=device), 0 * one, one, bounds
     foreground, opacity, depth, weights = integrate(*given)
@@ -116,7 +116,7 @@ def trial(device: str = "cuda") -> None:
 @triton.jit
 @no_type_check
 def _alpha(optical):
-    """Return 1 - exp(-x), by its series where that would lose all digits."""
+    """Return 1 - exp(-x), by its series where it would lose all digits."""
     series = optical * (1.0 - optical * (0.5 - optical * (1.0 / 6.0 - optical * (1.0 / 24.0))))
     return tl.where(optical < 0.03, series, 1.0 - tl.exp(-optical))
 
@@ -124,7 +124,7 @@ def _alpha(optical):
 @triton.jit
 @no_type_check
 def _samples_of(bounds, ray, each):
-    """Return the first sample of a ray, the one after its last, and by how much its intervals' numbers are higher."""
+    """Return the first sample of a ray, the one after its last, and the offset of its intervals' indices."""
     if each > 0:
         first = ray.to(tl.int64) * each
         last = first + each
@@ -139,7 +139,7 @@ def _samples_of(bounds, ray, each):
 @triton.jit
 @no_type_check
 def _optical(density, starts, ends, sample, valid):
-    """Return density times length of some samples, and where their middles are."""
+    """Return density times length of some samples, and their midpoints."""
     begin, end = tl.load(starts + sample, mask=valid, other=0.0), tl.load(ends + sample, mask=valid, other=0.0)
     return tl.load(density + sample, mask=valid, other=0.0) * (end - begin), 0.5 * (begin + end)
 
@@ -147,9 +147,9 @@ def _optical(density, starts, ends, sample, valid):
 @triton.jit
 @no_type_check
 def _light(before, density, starts, ends, sample, first, valid):
-    """Return the light that reaches some samples in a row, given the optical depth before them.
+    """Return the light that reaches some consecutive samples, given the optical depth before them.
 
-    The sum is of the samples before each: a difference would lose what lies in front of a dense one.
+    The sum excludes each sample itself: subtracting it would lose what is in front of a dense one.
     """
     nearer, _ = _optical(density, starts, ends, sample - 1, valid & (sample > first))
     return tl.exp(-(before + tl.cumsum(nearer, axis=0)))
@@ -206,7 +206,7 @@ def _integrate_back(
     for start in range(first, last, block):
         sample = start + lane
         optical, _ = _optical(density, starts, ends, sample, sample < last)
-        # Kept for the way back: the light behind each sample.
+        # Kept for the reverse loop: the light behind each sample.
         tl.store(of_density + sample, tl.exp(-(before + tl.cumsum(optical, axis=0))), mask=sample < last)
         before += tl.sum(optical, axis=0)
     tl.debug_barrier()

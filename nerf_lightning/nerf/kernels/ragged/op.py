@@ -1,7 +1,7 @@
 """Volume rendering of ragged samples, and where rays become opaque.
 
-Letters as in `rendering.quadrature`. With g_j the loss's derivative by w_j, that by density is
-delta_i (T_{i+1} g_i - sum_{j>i} w_j g_j).
+Letters as in `rendering.quadrature`. With g_j the derivative of the loss by w_j, that by the density is delta_i
+(T_{i+1} g_i - sum_{j>i} w_j g_j).
 """
 
 from typing import Any
@@ -38,13 +38,13 @@ def integrate_dense(
     edges: Float[Tensor, "*rays edges"],
     closed: bool,
 ) -> Integrated | None:
-    """Return the same for rays with equally many samples; None where there is no kernel for it.
+    """Return the same for rays with the same number of samples; None if there is no kernel for it.
 
     Args:
         density: per unit length.
         rgb: in [0, 1].
         edges: fenceposts of the intervals.
-        closed: whether the last sample takes all the light that is left.
+        closed: whether the last sample absorbs all remaining light.
     """
     single = all(each.dtype == torch.float32 for each in (density, rgb, edges))
     backend = cuda_backend("ragged.cuda", density.device) if single and not edges.requires_grad else None
@@ -57,7 +57,7 @@ def integrate_dense(
 
 
 def num_visible(density: Float[Tensor, "capacity"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
-    """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
+    """Return how many samples of each ray begin where the transmittance exceeds `opaque_below`."""
     backend = backend_for("ragged", density.device)
     if backend is not None and density.dtype == torch.float32:
         return backend.num_visible(density, samples, opaque_below)
@@ -75,14 +75,14 @@ def first_of_each_ray(
 ) -> tuple[RaggedSamples, Float[Tensor, "kept features"] | None]:
     """Return the first `counts` samples of each ray, and their features, without gradients.
 
-    `found` is then the number of those and of the samples that had been dropped before, which nobody has looked at.
+    `found` then counts these and the samples that had been dropped before, whose visibility is unknown.
 
     Args:
         samples: all of them.
-        counts: how many of each ray are kept.
-        features: of all samples, if there are any; padding gets zeros.
-        capacity: size of the arrays returned; nothing is read on the host, and what does not fit is dropped from the
-            last rays. None: as many as there are.
+        counts: number of samples kept of each ray.
+        features: features of all samples, if there are any; padding gets zeros.
+        capacity: size of the returned arrays, so that no size is read on the host; what does not fit is dropped from
+            the last rays. None: as many as there are.
     """
     backend = cuda_backend("ragged.cuda", counts.device)
     if backend is not None and capacity is not None:

@@ -1,4 +1,4 @@
-"""Rendering of ragged samples in plain torch: the reference, and what runs without kernels."""
+"""Rendering of ragged samples in plain torch: the reference, and the fallback without kernels."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from nerf_lightning.nerf.types.rays import RaggedSamples
 
 def transmittance_torch(density: Float[Tensor, "capacity"], samples: RaggedSamples) -> Float[Tensor, "capacity"]:
     """Return the light that reaches the start of each interval."""
-    # A row of a table for each ray: sums of their own are exact in float32, and no two samples share a cell, so what
-    # flows back waits for nothing. Padding has rows of its own.
+    # One row of a table per ray: separate sums are exact in float32, and no two samples share a cell, so gradients need
+    # not wait. Padding has its own rows.
     rays, capacity = samples.bounds.shape[0] - 1, density.shape[0]
     longest = int(samples.bounds.diff().amax()) if samples.longest is None and rays else samples.longest
     columns = max(1, longest or 0)

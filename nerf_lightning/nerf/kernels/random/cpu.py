@@ -1,4 +1,4 @@
-"""Random numbers and permutations for the CPU, bit for bit those of `nerf.randomness`."""
+"""Random numbers and permutations for the CPU, bit-identical to `nerf.randomness`."""
 
 from typing import no_type_check
 
@@ -15,7 +15,7 @@ from nerf_lightning.nerf.randomness import grid_of, round_words
 def uniform(
     keys: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], purpose: int, count: int
 ) -> Float[Tensor, "*rays {count}"] | None:
-    """Return `count` numbers per ray, uniform on [0, 1); None where rays are not in a row."""
+    """Return `count` numbers per ray, uniform on [0, 1); None if rays are not contiguous."""
     if slots.dim() != 1:
         return None
     out = torch.empty(len(slots), count)
@@ -24,7 +24,7 @@ def uniform(
 
 
 def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"] | None:
-    """Return where a permutation of range(size) sends each index; None where they are not in a row, with one key."""
+    """Return where a permutation of range(size) maps each index; None unless they are contiguous, with one key."""
     if key.numel() != 1 or index.dim() != 1:
         return None
     out, words = torch.empty_like(index), np.array(round_words(int(key)))
@@ -33,7 +33,7 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler raises."""
     one = torch.ones(1, dtype=torch.int64)
     uniform(one, one, 1, 1)
     permute(one, 2, one)

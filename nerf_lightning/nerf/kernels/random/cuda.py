@@ -1,4 +1,4 @@
-"""Random numbers for CUDA, bit for bit those of `nerf.randomness`; `TRITON_INTERPRET=1` runs them without a GPU."""
+"""Random numbers for CUDA, bit-identical to `nerf.randomness`; `TRITON_INTERPRET=1` runs them without a GPU."""
 
 from typing import no_type_check
 
@@ -14,7 +14,7 @@ BLOCK = 512
 def uniform(
     keys: Int[Tensor, "*rays"], slots: Int[Tensor, "*rays"], purpose: int, count: int
 ) -> Float[Tensor, "*rays {count}"] | None:
-    """Return `count` numbers per ray, uniform on [0, 1); None where rays are not in a row."""
+    """Return `count` numbers per ray, uniform on [0, 1); None if rays are not contiguous."""
     if slots.dim() != 1:
         return None
     out = torch.empty(len(slots), count, device=slots.device)
@@ -25,7 +25,7 @@ def uniform(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     one = torch.ones(1, dtype=torch.int64, device=device)
     found = uniform(one, one, 1, 1)
     if found is None or not 0.0 <= float(found) < 1.0:

@@ -1,7 +1,7 @@
-"""Rays through pixels for CUDA, of pinholes and of radial and tangential lenses.
+"""Rays through pixels for CUDA, for pinholes and radial and tangential lenses.
 
-One kernel does what `geometry.cameras.rays_through_pixels` does, with the iteration of `geometry.lenses` and the sides
-of pixels. `TRITON_INTERPRET=1` runs it without a GPU.
+One kernel does all of `geometry.cameras.rays_through_pixels`, including the iteration of `geometry.lenses` and the
+sides of pixels. `TRITON_INTERPRET=1` runs it without a GPU.
 """
 
 from typing import no_type_check
@@ -28,15 +28,15 @@ def rays_through_pixels(
     subpixel_offset: Float[Tensor, "*#rays 2"] | None = None,
     per_side: int = 1,
 ) -> RayBundle | None:
-    """Return the rays through the centers of pixels; None for other places in them, lenses, coordinates or gradients.
+    """Return the rays through the centers of pixels; None for other offsets, lenses, coordinates or gradients.
 
     Args:
         cameras: one per view.
-        pixels: which.
+        pixels: the pixels.
         near: where the rays of each view begin.
         far: where they end.
-        subpixel_offset: from the center of its pixel to where each ray passes; None: none.
-        per_side: so many rays share each side of a pixel.
+        subpixel_offset: each ray's offset from the center of its pixel; None: none.
+        per_side: number of rays along each side of a pixel.
     """
     learnt = (cameras.c2w, cameras.focal, cameras.center, cameras.lens)
     if subpixel_offset is not None or cameras.ndc is not None or cameras.lens_model not in LENSES:
@@ -57,10 +57,10 @@ def rays_through_pixels(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler or driver raises.
+    """Run the kernel once on tiny input; it raises whatever the compiler or driver raises.
 
     Raises:
-        RuntimeError: it computes wrongly.
+        RuntimeError: the result is wrong.
     """
     one, zero = torch.ones(2, device=device), torch.zeros(2, dtype=torch.int64, device=device)
     lens, size, c2w = torch.zeros(2, 6, device=device), zero + 1, torch.eye(3, 4, device=device).expand(2, 3, 4)
@@ -90,7 +90,7 @@ def _distorted(x, y, k1, k2, k3, k4, p1, p2):
 @triton.jit
 @no_type_check
 def _turned(row, x, y):
-    """Return one coordinate in the world of (x, -y, -1), given a row of the camera's matrix."""
+    """Return one world coordinate of (x, -y, -1), given a row of the camera's matrix."""
     return tl.load(row) * x - tl.load(row + 1) * y - tl.load(row + 2)
 
 

@@ -1,4 +1,4 @@
-"""What the kernels of whole rays with gradients keep of each sample, and how a block of samples comes to it.
+"""What whole-ray kernels with gradients keep of each sample, and how they compute it for a block of samples.
 
 Letters as in `rendering.quadrature`.
 """
@@ -14,8 +14,8 @@ from nerf_lightning.nerf.kernels.render.cpu import LARGEST_RAW, is_inside
 from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponentials, sigmoids
 
 BACK, LIGHT, WEIGHT, SHARE, COLOR, DISTANCE = 0, 1, 2, 3, 4, 7
-"""Of each sample: length times slope of the density times SHARE; the light behind it; its weight; the share of its
-gradients that counts (`rendering.near_gradients`); three colors; its distance."""
+"""Columns of each sample: length times slope of the density times SHARE; the light behind it; its weight; the share of
+its gradients that counts (`rendering.near_gradients`); three colors; its distance."""
 LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
 ONE, ZERO = np.float32(1.0), np.float32(0.0)
 
@@ -23,7 +23,7 @@ ONE, ZERO = np.float32(1.0), np.float32(0.0)
 @njit
 @no_type_check
 def new_rooms():
-    """Return what `absorb` and `shade` compute in: three rows of numbers, and one of bits."""
+    """Return scratch space for `absorb` and `shade`: three rows of numbers, and one of bits."""
     floats = np.zeros((3, ROWS), np.float32)
     return floats[0], floats[1], floats[2], np.zeros(ROWS, np.int32)
 
@@ -31,9 +31,9 @@ def new_rooms():
 @njit
 @no_type_check
 def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, numbers, rooms):
-    """Leave each sample's alpha in the third of the rooms, given its raw density; and in `numbers` what gradients need.
+    """Write each sample's alpha, given its raw density, to the third of `rooms`, and what gradients need to `numbers`.
 
-    Outside of the unit cube there is nothing, unless `everywhere`; from `whole_from` on gradients are whole.
+    Space outside the unit cube is empty, unless `everywhere`; from distance `whole_from` on, gradients are whole.
     """
     biased, density, alpha, bits = rooms
     for i in range(count):
@@ -48,7 +48,7 @@ def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, nu
             share = min((t[i] / whole_from) ** 2, ONE)
         numbers[i, BACK], numbers[i, SHARE] = delta[i] * density[i] * share, share
     for i in range(count):
-        if abs(biased[i]) > LARGEST_SLOPE and density[i] > ZERO:  # rare, and a call: apart, the others become vectors
+        if abs(biased[i]) > LARGEST_SLOPE and density[i] > ZERO:  # rare, and a call: apart, so the others vectorize
             slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
             numbers[i, BACK] = delta[i] * slope * numbers[i, SHARE]
         density[i] *= delta[i]
@@ -58,7 +58,7 @@ def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, nu
 @njit
 @no_type_check
 def shade(count, flat, outer, owner, numbers, rooms, foreground):
-    """Add weighted colors to the foreground of each sample's ray, given raw ones; some samples have no owner."""
+    """Add weighted colors, given raw ones, to the foreground of each sample's ray; some samples have no owner."""
     raw, shades, _, bits = rooms
     for c in range(3):
         for i in range(count):

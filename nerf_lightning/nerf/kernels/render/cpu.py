@@ -1,8 +1,8 @@
-"""Whole rays in one kernel: march, hash grid, perceptrons and quadrature, without gradients.
+"""Whole rays in one kernel: march, hash grid, MLPs and quadrature, without gradients.
 
-ROWS rays are under way at a time, each with one sample: where a ray ends, the next one takes its place. So nothing is
-asked about what lies behind the sample that makes a ray opaque, and of a sample nothing but its light leaves the cache.
-What comes out for a ray does not depend on the others.
+ROWS rays are processed at a time, each with one sample: when a ray ends, the next one takes its place. So nothing
+behind the sample that makes a ray opaque is evaluated, and only a sample's light leaves the cache. A ray's result does
+not depend on the others.
 """
 
 import math
@@ -36,7 +36,7 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW = np.float32(LARGEST_RAW_DENSITY)
-"""The field's own bound on what its exponential is asked for."""
+"""The field's own bound on the argument of its exponential."""
 
 
 def render(
@@ -53,13 +53,13 @@ def render(
 
     Args:
         rays: unit directions, scene units.
-        field: what is asked about the samples.
-        state: where each ray's march begins.
+        field: table and weights.
+        state: the start of each ray's march.
         lattice: the intervals (`kernels.march`).
-        grid: which of them are asked about.
-        least_alpha: less opaque samples count with their density and without their color.
-        opaque_below: a ray ends where less light than this is left.
-        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
+        grid: the cells where the field is evaluated.
+        least_alpha: samples less opaque than this count with their density, but not their color.
+        opaque_below: a ray ends where its transmittance falls below this.
+        dtype: dtype to which the factors of the MLPs' products are rounded: float32 or bfloat16.
     """
     count = rays.near.shape[0]
     out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
@@ -75,13 +75,13 @@ def render(
 
 
 def trial() -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
+    """Run the kernel once on tiny input; it raises whatever the compiler raises."""
     for dtype in dtypes():
         render(*trial_arguments(), 1e-3, 1e-3, dtype)
 
 
 def trial_arguments() -> tuple[RayBundle, FieldParts, MarchState, Tensor, OccupancyCells]:
-    """Return a ray, a field, and what the ray marches through."""
+    """Return a ray, a field, and a grid for the ray to march through."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(*[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -103,19 +103,19 @@ def trial_arguments() -> tuple[RayBundle, FieldParts, MarchState, Tensor, Occupa
 def along(
     rays: RayBundle, field: FieldParts, state: MarchState, lattice: Tensor, grid: OccupancyCells
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
-    """Return what kernels take of rays: the march, where they run through the world, and features of directions."""
+    """Return rays as arguments of kernels: the march, their place in the world, and features of directions."""
     march = (*grid.in_box(rays), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
     world, directions = (rays.origins, rays.directions, field.aabb), field.ray_features(rays)
     return arrays_of(march), arrays_of(world), arrays_of((directions.float(),))[0]
 
 
 def arrays_of(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
-    """Return what kernels take of tensors."""
+    """Return tensors as arguments of kernels."""
     return tuple(each.detach().contiguous().numpy() for each in tensors)
 
 
 def network(weights: list[Tensor], dtype: torch.dtype, transposed: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Return a perceptron's words, for the way there or back, and its widths."""
+    """Return an MLP's words, for the forward or the backward pass, and its widths."""
     widths = padded_widths(weights)
     return packed_words([weight.detach().to(dtype) for weight in weights], widths, transposed), np.array(widths)
 
@@ -123,7 +123,7 @@ def network(weights: list[Tensor], dtype: torch.dtype, transposed: bool = False)
 @njit
 @no_type_check
 def next_sample(march, r, k):
-    """Return the first interval of a ray from k on that may hold something; the lattice's end if there is none."""
+    """Return the first interval of a ray, from k on, that may hold something; the lattice's end if there is none."""
     o, d, _, leave, jitters, lattice, cells, leaps = march
     return next_occupied(
         *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
@@ -141,7 +141,7 @@ def interval(march, r, k):
 @njit
 @no_type_check
 def _go_on(march, live, ray, sample_index, light, opaque_below):
-    # Ends the rays that are opaque or have no samples left, and takes the others to their next; returns how many go on.
+    # End rays that are opaque or out of samples, and move the others to their next sample; return how many remain.
     end, s = march[5].shape[0] - 2, 0
     while s < live:
         k = next_sample(march, ray[s], sample_index[s] + 1) if light[s] > opaque_below else end
@@ -157,7 +157,7 @@ def _go_on(march, live, ray, sample_index, light, opaque_below):
 @njit
 @no_type_check
 def start(march, most, live, waiting, last, ray, sample_index, light):
-    """Fill free places, up to `most`, with rays that meet something; return how many are taken, and the next ray."""
+    """Fill free slots, up to `most`, with rays that meet something; return how many are in use, and the next ray."""
     enter, leave, jitters, lattice = march[2:6]
     while live < most and waiting < last:
         r = waiting
@@ -173,7 +173,7 @@ def start(march, most, live, waiting, last, ray, sample_index, light):
 @njit
 @no_type_check
 def locate(world, r, t, points, s):
-    """Write where a ray is at a distance, in the field's box as the unit cube."""
+    """Write the position of a ray at a distance, with the field's box as the unit cube."""
     origins, directions, aabb = world
     for axis in range(3):
         at = origins[r, axis] + t * directions[r, axis]
@@ -183,8 +183,8 @@ def locate(world, r, t, points, s):
 @njit
 @no_type_check
 def fill(inputs, row, hidden, flat, begin, directions, r):
-    """Write a sample's inputs of the colors: what the density hands over, and features of the ray's direction."""
-    # Numbers one by one: with slices, numba also compiles the formatting of an error message, for seconds.
+    """Write a sample's inputs of the color MLP: the density MLP's features, and features of the ray's direction."""
+    # One number at a time: with slices, numba would spend seconds compiling the formatting of an error message.
     for c in range(hidden):
         inputs[row, c] = flat[begin + c]
     for c in range(directions.shape[1]):
@@ -194,7 +194,7 @@ def fill(inputs, row, hidden, flat, begin, directions, r):
 @njit
 @no_type_check
 def is_inside(points, s):
-    """Return whether a sample lies in the unit cube, outside of which there is nothing."""
+    """Return whether a sample is in the unit cube, outside of which space is empty."""
     x, y, z = points[s, 0], points[s, 1], points[s, 2]
     return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
 
@@ -218,14 +218,14 @@ def _render(kind, first, last, march, world, directions, hidden, table, levels, 
     density_words, dims, color_words, color_dims = networks
     bias, least_alpha, opaque_below = limits
     foreground, opacity, depth = out
-    # Of the rays under way: which, how much light comes through to where they stand, and at which interval that is.
+    # The active rays: index, current interval, and transmittance.
     ray, sample_index, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
     begin, stop = light.copy(), light.copy()
     points, features = np.zeros((ROWS, 3), np.float32), np.zeros((ROWS, dims[0]), np.float32)
     size, sums = bytes_of(kind), np.zeros((ROWS, dims.max()), np.float32)
     words = np.zeros((ROWS, dims[:-1].sum() * size // 4), np.int32)
     flat, outer = sums.reshape(-1), dims[-1]
-    # Of the samples whose colors are asked for together.
+    # The samples whose colors are computed together.
     inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
     between = np.zeros((ROWS, color_dims[:-1].sum() * size // 4), np.int32)
     colors = np.zeros((ROWS, color_dims.max()), np.float32)

@@ -1,9 +1,9 @@
-"""Samples to pixels on CUDA: what lies between the large kernels, in one pass each.
+"""Samples to pixels on CUDA: the operations between the large kernels, in one pass each.
 
-The hash grid, the perceptrons and the quadrature have kernels of their own; from rays to their points, from hidden
-features to the inputs of the color, and from raw numbers to density and color are functions of single samples, which
-plain torch would compute in dozens of passes. `TRITON_INTERPRET=1` runs the kernels without a GPU. The results are the
-same in each run, but for the gradient of the hash grid, which is summed up atomically.
+The hash grid, the MLPs and the quadrature have their own kernels; the steps from rays to points, from hidden features
+to the inputs of the color, and from raw outputs to density and color are functions of single samples, which plain torch
+would compute in dozens of passes. `TRITON_INTERPRET=1` runs the kernels without a GPU. Results are deterministic,
+except for the gradient of the hash grid, which is summed atomically.
 """
 
 from dataclasses import replace
@@ -36,16 +36,16 @@ def render(
     whole_from: float,
     features: Float[Tensor, "samples features"] | None,
 ) -> Integrated:
-    """Return what is seen along rays, with gradients for the field's table and weights.
+    """Return the integrals along rays, with gradients for the field's table and weights.
 
     Args:
         rays: unit directions, scene units; one axis.
-        samples: where along them.
-        field: table and weights; where it has none of color, all is black.
-        matmul_precision: of the perceptrons' products.
-        closed: whether the last sample of a ray takes all the light that is left.
-        whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
-        features: of the hash grid, where `density` has computed them; None: they are computed here.
+        samples: the samples along them.
+        field: table and weights; without weights of color, everything is black.
+        matmul_precision: precision of the MLPs' products.
+        closed: whether the last sample of a ray absorbs all remaining light.
+        whole_from: gradients of samples nearer than this are scaled down (`rendering.near_gradients`); 0: of none.
+        features: features of the hash grid, if `density` has computed them; None: they are computed here.
     """
     where = _Where(rays, samples)
     points = _points(rays, where, field)
@@ -67,7 +67,7 @@ def render(
 def density(
     rays: RayBundle, samples: RaggedSamples, field: FieldParts, matmul_precision: MatmulPrecision
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]]:
-    """Return the density at samples, and the features of the hash grid there, without gradients."""
+    """Return the density and the features of the hash grid at samples, without gradients."""
     where = _Where(rays, samples)
     points = _points(rays, where, field)
     with torch.no_grad():
@@ -78,7 +78,7 @@ def density(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run every kernel once on tiny input; it raises whatever the compiler or driver raises."""
     one, along = torch.ones(2, device=device), torch.tensor([[0.0, 0.0, 1.0]] * 2, device=device)
     rays, layout = RayBundle(-2 * along, along, one, 3 * one, along), hash_grid_layout(2, 6, 2, 8)
     table = torch.ones(layout.offsets[-1], 2, device=device, requires_grad=True)
@@ -94,26 +94,26 @@ def trial(device: str = "cuda") -> None:
 
 
 class _Where:
-    """Where samples are: of which ray, and between which distances."""
+    """Positions of samples: their rays and distances."""
 
     def __init__(self, rays: RayBundle, samples: RaggedSamples | RaySamples):
         self.starts = samples.starts if isinstance(samples, RaggedSamples) else samples.edges.contiguous()
         self.ends = samples.ends if isinstance(samples, RaggedSamples) else self.starts.view(-1)[1:]
         self.ray_index = samples.ray_index if isinstance(samples, RaggedSamples) else self.starts
         self.each = 0 if isinstance(samples, RaggedSamples) else samples.edges.shape[-1] - 1
-        """Samples of every ray; 0: as the index says."""
+        """Samples per ray; 0: as the index says."""
         self.used = samples.bounds[-1:] if isinstance(samples, RaggedSamples) else None
-        """How many there are before the padding, on the device; None: there is none."""
+        """Number of samples before the padding, on the device; None: no padding."""
         self.count = self.starts.shape[0] if self.each == 0 else rays.near.shape[0] * self.each
 
     @property
     def arrays(self) -> tuple[Tensor, Tensor, Tensor]:
-        """For the kernels."""
+        """Return the arguments of the kernels."""
         return self.ray_index, self.starts, self.ends
 
     @property
     def programs(self) -> tuple[int]:
-        """That take a block of samples each."""
+        """The number of programs, each of which takes a block of samples."""
         return (triton.cdiv(self.count, BLOCK),)
 
 
@@ -127,7 +127,7 @@ def _points(rays: RayBundle, where: _Where, field: FieldParts) -> Float[Tensor, 
 
 
 class _Joined(torch.autograd.Function):
-    """The inputs of the colors: each sample's hidden features, and what its ray's samples share."""
+    """The inputs of the color MLP: each sample's hidden features, and what its ray's samples share."""
 
     @staticmethod
     def forward(ctx: Any, hidden: Tensor, shared: Tensor, where: _Where) -> Tensor:
@@ -147,7 +147,7 @@ class _Joined(torch.autograd.Function):
 
 
 class _Activated(torch.autograd.Function):
-    """Density and color of raw numbers (`nerf.activations`); outside of its box a field has no density."""
+    """Density and color from raw outputs (`nerf.activations`); outside its box a field has no density."""
 
     @staticmethod
     def forward(
@@ -182,7 +182,7 @@ class _Activated(torch.autograd.Function):
 @triton.jit
 @no_type_check
 def _midpoint(ray_index, starts, ends, sample, valid, each: tl.constexpr):
-    """Return the ray of some samples, and the distances of their middles."""
+    """Return the rays and midpoints of some samples."""
     if each > 0:
         ray = sample // each
         shift = ray
@@ -196,7 +196,7 @@ def _midpoint(ray_index, starts, ends, sample, valid, each: tl.constexpr):
 @triton.jit
 @no_type_check
 def _coordinate(origins, directions, aabb, ray, t, valid, axis: tl.constexpr):
-    """Return one coordinate of points on rays, in shares of the box's side."""
+    """Return one coordinate of points on rays, as shares of the box's side."""
     low, high = tl.load(aabb + axis), tl.load(aabb + 3 + axis)
     origin = tl.load(origins + 3 * ray + axis, mask=valid, other=0.0)
     return (origin + t * tl.load(directions + 3 * ray + axis, mask=valid, other=0.0) - low) / (high - low)
@@ -216,7 +216,7 @@ def _locate(
     z = _coordinate(origins, directions, aabb, ray, t, valid, 2)
     if (
         contracted
-    ):  # `geometry.contraction`: the box's corners lie on the unit ball, the ball of radius 2 fills the cube
+    ):  # `geometry.contraction`: the box's corners are on the unit sphere, and the ball of radius 2 fills the cube
         x, y, z = (2.0 * x - 1.0) / 1.7320508, (2.0 * y - 1.0) / 1.7320508, (2.0 * z - 1.0) / 1.7320508
         norm = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
         scale = 0.25 * (2.0 - 1.0 / norm) / norm
@@ -245,7 +245,7 @@ def _join(
 @triton.jit
 @no_type_check
 def _inside(points, sample, valid):
-    """Return whether points lie in the unit cube."""
+    """Return whether points are in the unit cube."""
     x = tl.load(points + 3 * sample, mask=valid, other=0.0)
     y = tl.load(points + 3 * sample + 1, mask=valid, other=0.0)
     z = tl.load(points + 3 * sample + 2, mask=valid, other=0.0)
@@ -294,7 +294,7 @@ def _activate_back(
     grad = tl.load(of_density + sample, mask=valid, other=0.0) * share * slope
     if boxed:
         grad = tl.where(_inside(points, sample, valid), grad, 0.0)
-    # The density is the first of the hidden features; a program writes rows that lie one after the other.
+    # The density is the first of the hidden features; a program writes contiguous rows.
     column = tl.arange(0, columns)[None, :]
     at = of_hidden + sample[:, None] * width + column
     tl.store(at, tl.where(column == 0, grad[:, None], 0.0), mask=valid[:, None] & (column < width))
@@ -303,6 +303,6 @@ def _activate_back(
             color = tl.load(rgb + 3 * sample + channel, mask=valid, other=0.0)
             grad = tl.load(of_rgb + 3 * sample + channel, mask=valid, other=0.0) * share
             slope = color * (1.0 - color)
-            # A step goes against the gradient: back from black, or from full.
+            # A step goes against the gradient: back from black or full.
             slope = tl.where(grad * (color - 0.5) > 0.0, tl.maximum(slope, least_slope), slope)
             tl.store(of_raw + 3 * sample + channel, grad * slope, mask=valid)

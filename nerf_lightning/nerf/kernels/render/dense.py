@@ -1,10 +1,10 @@
-"""Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
+"""Whole rays with equal numbers of samples in one kernel per pass: hash grid, MLPs, quadrature, and their gradients.
 
 Some rays go forward together, and blocks of ROWS samples go from positions to light while they are in the cache. The
-way back takes the blocks from the last to the first, so that of each ray those samples come first that lie farthest,
-and sums up what lies behind each.
+backward pass takes the blocks from last to first, so that the farthest samples of each ray come first, and accumulates
+what is behind each.
 
-Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
+Letters as in `rendering.quadrature`. The samples' positions along the rays have no gradient.
 """
 
 from dataclasses import dataclass
@@ -44,11 +44,11 @@ from nerf_lightning.nerf.types.rays import RayBundle
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
 FEWEST_RAYS = 32
 ABREAST = 128
-"""So many rays go forward together, a sample each, until they are opaque; those of a picture share the grid's cells."""
+"""Rays that go forward together, a sample each, until they are opaque; those of a picture share the grid's cells."""
 LEAST_WEIGHT = np.float32(1e-4)
-"""Where rays may end early, samples of less weight have no color."""
+"""If rays may end early, samples of less weight have no color."""
 COPY = np.float32(0)
-"""Tells `round_vector` to round to float32, which is to copy."""
+"""The kind with which `round_vector` rounds to float32, that is, copies."""
 
 
 def render(
@@ -60,19 +60,19 @@ def render(
     whole_from: float,
     opaque_below: float,
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
-    """Return the weights of all samples, and per ray sum of w rgb (nothing, for a field without colors).
+    """Return the weights of all samples, and per ray the sum of w rgb (0 for a field without colors).
 
-    Gradients go to the field's table and weights, to the features of directions, and to the rays' origins and
+    Gradients flow to the field's table and weights, to the features of directions, and to the rays' origins and
     directions.
 
     Args:
         rays: unit directions, scene units.
-        edges: the intervals, in whose midpoints the field is asked.
-        field: what is asked.
-        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
-        closed: whether the last interval takes all the light that is left.
+        edges: the intervals, at whose midpoints the field is evaluated.
+        field: table and weights.
+        dtype: dtype to which the factors of the MLPs' products are rounded: float32 or bfloat16.
+        closed: whether the last interval absorbs all remaining light.
         whole_from: `rendering.near_gradients`; 0: gradients are whole everywhere.
-        opaque_below: a sample behind which less light is left takes all of it, and ends its ray; 0: none does.
+        opaque_below: a sample behind which less light is left absorbs it all, and ends its ray; 0: none does.
     """
     features = field.ray_features(rays) if field.color_weights else torch.zeros(len(edges), 0)
     given = rays.origins, rays.directions, features, field.table, *field.density_weights, *field.color_weights
@@ -81,9 +81,9 @@ def render(
 
 
 def trial() -> None:
-    """Run the kernels once on next to nothing; it raises what compilers raise.
+    """Run the kernels once on tiny input; it raises whatever the compiler raises.
 
-    In the precision that training takes here by itself: those of the other are compiled by its first step.
+    In the default precision of training here: those of the other precision are compiled by its first step.
     """
     origins, along = torch.zeros(2, 3, requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
     rays = RayBundle(origins, along, torch.zeros(2), torch.ones(2), along)
@@ -104,7 +104,7 @@ def trial() -> None:
 
 @dataclass
 class _Call:
-    """All that a pass needs besides what has gradients."""
+    """All that a pass needs besides the tensors with gradients."""
 
     edges: Tensor
     field: FieldParts
@@ -119,8 +119,8 @@ class _Call:
         self.kind, self.edges = KINDS[self.dtype], self.edges.detach().float().contiguous()
         self.rays, self.samples = len(self.edges), self.edges.shape[1] - 1
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
-        self.kept: list[tuple[Workspace, int]] = []  # of each part, with the number of samples in it
-        # To the unit cube, or to the cube that the unit ball just holds (`geometry.contraction`).
+        self.kept: list[tuple[Workspace, int]] = []  # workspace of each part, with its number of samples
+        # To the unit cube, or to the cube inscribed in the unit ball (`geometry.contraction`).
         low, high = self.field.aabb
         side, shift = high - low, 0.0
         if self.field.contracted:
@@ -128,23 +128,23 @@ class _Call:
         self.scale, self.offset = 1.0 / side, -low / side - shift
 
     def networks(self, weights: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
-        """Return the words and widths of both perceptrons; no widths where there are no colors."""
+        """Return the words and widths of both MLPs; no widths if there are no colors."""
         density, color = self.split(weights)
         none = np.zeros(0, np.int32), np.zeros(0, np.int64)
         return (*network(density, self.dtype, transposed), *(network(color, self.dtype, transposed) if color else none))
 
     def split(self, weights: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the weights of the density's perceptron, and of the colors'."""
+        """Return the weights of the density MLP, and of the color MLP."""
         layers = len(self.field.density_weights)
         return weights[:layers], weights[layers:]
 
     def space(self, origins: Tensor, directions: Tensor) -> tuple[Any, ...]:
-        """Return the rays in the coordinates that are contracted, their intervals, and whether space is contracted."""
+        """Return the rays in the coordinates before contraction, their intervals, and whether space is contracted."""
         scaled = origins.float() * self.scale + self.offset, directions.float() * self.scale
         return (*arrays_of((*scaled, self.edges)), self.field.contracted)
 
     def grid(self, table: Tensor) -> tuple[Any, ...]:
-        """Return what looks features up."""
+        """Return the arguments for looking up features."""
         return arrays_of((table,))[0], *level_arrays(self.field.layout), (0,) * table.shape[1]
 
     def forward(self, origins: Tensor, directions: Tensor, features: Tensor, table: Tensor, *learnt: Tensor) -> Any:
@@ -175,11 +175,11 @@ class _Call:
         """Return the gradients of rays, all points and the gradients of their features, and those of the weights.
 
         Args:
-            wants_rays: whether origins and directions have gradients; those of what all samples share are cheap.
+            wants_rays: whether origins and directions need gradients; those of the shared features are cheap.
             rays: origins, directions, features.
-            table: of the grid.
-            weights: of both perceptrons.
-            grads: of what `forward` returned.
+            table: table of the grid.
+            weights: weights of both MLPs.
+            grads: gradients of what `forward` returned.
         """
         if not self.kept:
             raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
@@ -235,8 +235,8 @@ class _DenseRays(torch.autograd.Function):
 @njit
 @no_type_check
 def _next_samples(first, last, samples, at, lights, block):
-    # Fills a block, and returns how many samples it has, and where the next one begins. Of the rays that go forward
-    # together come the first samples, the second ones, and so on, as far as light gets through.
+    # Fill a block, and return how many samples it has, and where the next one begins. The rays that go forward together
+    # contribute their first samples, then their second ones, and so on, as far as light gets through.
     leftmost, k, c = at
     count, width = 0, min(ABREAST, last - leftmost)
     while count < ROWS and leftmost < last:
@@ -255,7 +255,7 @@ def _next_samples(first, last, samples, at, lights, block):
 @njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
 def _place(space, count, block, points):
-    # Distance, length and place of a block's samples, in the unit cube.
+    # Distance, length and position (in the unit cube) of a block's samples.
     origins, directions, edges, contracted = space
     owner, sample, t, delta, x, y, z = block
     for i in range(count):
@@ -277,7 +277,7 @@ def _place(space, count, block, points):
 @njit
 @no_type_check
 def _composite(count, first, closed, opaque_below, block, alpha, lights, numbers, weights):
-    # From front to back; `lights` has what is left behind the last sample of each ray.
+    # From front to back; `lights` is the light left behind the last sample of each ray.
     last = weights.shape[1] - 1
     for i in range(count):
         r, k = block[0][i], block[1][i]
@@ -292,7 +292,7 @@ def _composite(count, first, closed, opaque_below, block, alpha, lights, numbers
 @njit
 @no_type_check
 def _copy_numbers(source, target, count):
-    # Whole vectors while there are any.
+    # Whole vectors first.
     done = 0
     while count - done >= LANES:
         round_vector(COPY, source + 4 * done, target + 4 * done)
@@ -303,7 +303,7 @@ def _copy_numbers(source, target, count):
 @njit
 @no_type_check
 def _color_inputs(i, r, hidden, flat, outer, of_rays, inputs, row):
-    # Of a block's sample what the density hands over, and behind it what all samples of its ray share.
+    # A sample's features from the density MLP, followed by what all samples of its ray share.
     shared, to = of_rays.shape[1], address(inputs) + 4 * row * inputs.shape[1]
     for c in range(_copy_numbers(address(flat) + 4 * i * outer, to, hidden), hidden):
         inputs[row, c] = flat[i * outer + c]
@@ -361,7 +361,7 @@ def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call,
 @njit
 @no_type_check
 def _show_colors(kind, count, hues, color_words, color_dims, rooms, foreground):
-    # Of samples that have waited: add their weighted colors to what their rays show.
+    # Add the weighted colors of waiting samples to their rays.
     owners, inputs, numbers, words, sums = hues
     x, y = address(words), address(sums)
     round_rows(kind, address(inputs), 4 * color_dims[0], x, bytes_of(kind) * color_dims[0], ROWS, color_dims[0])
@@ -372,7 +372,7 @@ def _show_colors(kind, count, hues, color_words, color_dims, rooms, foreground):
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, out):
-    # As `_forward`, with no way back: rays end where they are opaque, and samples with some weight wait for their
+    # As `_forward`, without gradients: rays end where they are opaque, and samples with some weight wait for their
     # colors until there is a block of them.
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
@@ -418,7 +418,7 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
 @njit
 @no_type_check
 def _composite_back(count, first, colored, least_slope, grads, block, numbers, behind, outer, flat, raw):
-    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front.
+    # Gradients of a block's raw colors, contiguous in `flat`, and of its raw densities; from back to front.
     of_weights, of_light = grads
     flat[: ROWS * outer] = ZERO
     raw[count:] = ZERO
@@ -429,7 +429,7 @@ def _composite_back(count, first, colored, least_slope, grads, block, numbers, b
             shade, toward = numbers[i, COLOR + c], of_light[r, c] * w
             g += of_light[r, c] * shade
             slope = shade * (ONE - shade)
-            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
+            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black or full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope * numbers[i, SHARE]
         raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])
@@ -439,7 +439,7 @@ def _composite_back(count, first, colored, least_slope, grads, block, numbers, b
 @njit
 @no_type_check
 def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
-    # From the gradients of the colors' inputs to those of what the density's perceptron gave, and of what rays share.
+    # From the gradients of the color MLP's inputs to those of the density MLP's outputs, and of what rays share.
     flat[: ROWS * outer] = ZERO
     for i in range(count):
         given, to = address(passed) + 4 * i * passed.shape[1], address(flat) + 4 * i * outer

@@ -1,10 +1,10 @@
-"""Whole rays in one kernel per pass, with gradients: march, hash grid, perceptrons, quadrature, and the way back.
+"""Whole rays in one kernel per pass, with gradients: march, hash grid, MLPs and quadrature.
 
-As in `cpu.py` ROWS samples are taken at a time, but of fewer rays: each takes some in a row, more where few are left.
-What the way back needs is kept block by block. It takes the blocks from the last to the first, so that of each ray
-those samples come first that lie farthest, and sums up what lies behind each.
+As in `cpu.py`, ROWS samples are processed at a time, but of fewer rays: each contributes several consecutive ones, more
+if few rays are left. What the backward pass needs is kept block by block. It takes the blocks from last to first, so
+that the farthest samples of each ray come first, and accumulates what is behind each.
 
-Letters as in `kernels.ragged.op`. Where the samples lie has no gradient.
+Letters as in `kernels.ragged.op`. The samples' positions along the rays have no gradient.
 """
 
 from itertools import pairwise
@@ -61,8 +61,8 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 SLOTS = 64
-"""So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
-asked about in vain."""
+"""Number of rays processed at a time. Consecutive samples are close in the tables, but those behind an opaque one are
+evaluated in vain."""
 SPARE_ROWS, FEWEST_RAYS = 8 * ROWS, 64
 
 
@@ -76,20 +76,20 @@ def render(
     dtype: torch.dtype,
     samples_per_ray: float,
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], int]:
-    """Return, per ray, sum of w rgb, sum of w, and sum of w t; and how many samples were asked about.
+    """Return, per ray, sum of w rgb, sum of w, and sum of w t; and how many samples were evaluated.
 
-    Gradients go to the field's table and weights. The arguments are those of `cpu.render`; every sample counts with its
-    color.
+    Gradients flow to the field's table and weights. The arguments are those of `cpu.render`; every sample counts with
+    its color.
 
     Args:
         rays: unit directions, scene units.
-        field: what is asked about the samples.
-        state: where each ray's march begins.
+        field: table and weights.
+        state: the start of each ray's march.
         lattice: the intervals (`kernels.march`).
-        grid: which of them are asked about.
-        opaque_below: a ray ends where less light than this is left.
-        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
-        samples_per_ray: about how many there will be.
+        grid: the cells where the field is evaluated.
+        opaque_below: a ray ends where its transmittance falls below this.
+        dtype: dtype to which the factors of the MLPs' products are rounded: float32 or bfloat16.
+        samples_per_ray: approximate number of samples per ray.
     """
     given = _Given(rays, field, state, lattice, grid, opaque_below, dtype, samples_per_ray)
     out = _WholeRays.apply(given, field.table, *field.density_weights, *field.color_weights)
@@ -97,7 +97,7 @@ def render(
 
 
 def trial() -> None:
-    """Run the kernels once on next to nothing, in the precision that training takes here by itself."""
+    """Run the kernels once on tiny input, in the default precision of training here."""
     rays, field, state, lattice, grid = trial_arguments()
     field.table.requires_grad_()
     light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtypes()[-1], 1.0)
@@ -105,7 +105,7 @@ def trial() -> None:
 
 
 class _Given:
-    """All that a pass needs besides what has gradients."""
+    """All that a pass needs besides the tensors with gradients."""
 
     def __init__(
         self,
@@ -128,11 +128,11 @@ class _Given:
         self.used: list[int] = []
 
     def networks(self, density: list[Tensor], color: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
-        """Return the words and widths of both perceptrons."""
+        """Return the words and widths of both MLPs."""
         return (*network(density, self.dtype, transposed), *network(color, self.dtype, transposed))
 
     def see(self, table: Tensor, density: list[Tensor], color: list[Tensor], out: tuple[Tensor, ...]) -> None:
-        """Render, and keep what the way back needs."""
+        """Render, and keep what the backward pass needs."""
         of_field = arrays_of((table,))[0], (*level_arrays(self.field.layout), (0,) * table.shape[1])
         given = self.march, self.world, self.directions, *of_field, self.networks(density, color, False), self.limits
         of_density, of_color = (words_of(sum(padded_widths(weights)[:-1]), self.dtype) for weights in (density, color))
@@ -155,7 +155,7 @@ class _Given:
     def go_back(
         self, density: list[Tensor], color: list[Tensor], grads: tuple[Tensor, ...]
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Return the gradients of the weights; and all points, with the gradients of their features."""
+        """Return the gradients of the weights, and all points with the gradients of their features."""
         if not self.workspaces:
             raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
         networks, arrays = self.networks(density, color, True), arrays_of(grads)
@@ -205,7 +205,7 @@ class _WholeRays(torch.autograd.Function):
 @njit
 @no_type_check
 def _take(march, world, live, ray, sample_index, slots, owners, lengths, distances, points):
-    # Gives each ray under way its next samples, as many as there is room for; returns how many samples there are.
+    # Give each active ray its next samples, as many as there is room for; return the number of samples.
     each, end, count = ROWS // live, march[5].shape[0] - 2, 0
     for s in range(live):
         r, k = ray[s], sample_index[s]
@@ -226,7 +226,7 @@ def _take(march, world, live, ray, sample_index, slots, owners, lengths, distanc
 @njit
 @no_type_check
 def _composite(count, alpha, opaque_below, slots, light, owners, distances, numbers, opacity, depth):
-    # Ray by ray from front to back; samples behind an opaque one get no owner. Returns how many have one.
+    # Ray by ray from front to back; samples behind an opaque one get no owner. Return how many have one.
     seen = 0
     for i in range(count):
         s = slots[i]
@@ -245,7 +245,7 @@ def _composite(count, alpha, opaque_below, slots, light, owners, distances, numb
 @njit
 @no_type_check
 def _end(live, end, opaque_below, ray, sample_index, light):
-    # Leaves the rays out that are opaque or have no samples left; returns how many go on.
+    # Drop rays that are opaque or out of samples; return how many remain.
     s = 0
     while s < live:
         if light[s] > opaque_below and sample_index[s] < end:
@@ -302,7 +302,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
 @njit
 @no_type_check
 def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
-    # Gradients of a block's raw colors, side by side in `flat`, and of its raw densities; from back to front.
+    # Gradients of a block's raw colors, contiguous in `flat`, and of its raw densities; from back to front.
     of_light, of_opacity, of_depth = grads
     flat[: ROWS * outer] = ZERO
     for i in range(ROWS - 1, -1, -1):
@@ -316,7 +316,7 @@ def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, f
             shade, toward = numbers[i, COLOR + c], of_light[r, c] * w
             g += of_light[r, c] * shade
             slope = shade * (ONE - shade)
-            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
+            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black or full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope
         of_density[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])

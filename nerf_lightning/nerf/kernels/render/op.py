@@ -1,7 +1,7 @@
-"""Rays rendered from end to end in one kernel: the one front of these kernels, for any level that offers its rays.
+"""Whole rays rendered in one kernel: the interface of these kernels, for any level that offers its rays.
 
-On the CPU there are kernels for levels that march through an occupancy grid, and for those with equally many samples on
-every ray. On CUDA rays take several kernels, one after the other (`render_samples`).
+On the CPU there are kernels for levels that march through an occupancy grid, and for those with the same number of
+samples on every ray. On CUDA rays take several kernels, one after another (`render_samples`).
 """
 
 from collections.abc import Callable
@@ -24,41 +24,42 @@ LEARNING, RENDERING, DENSE, SAMPLES = "render.gradients", "render.cpu", "render.
 
 @dataclass(frozen=True)
 class FieldParts:
-    """What of a field the kernels compute with.
+    """The parts of a field that the kernels compute with.
 
-    A hash grid, and two perceptrons without biases: density, and color by what that hands on.
+    A hash grid, and two MLPs without biases: density, and color from the density MLP's outputs.
     """
 
     aabb: Float[Tensor, "2 3"]
-    """The box, outside of which there is nothing. Where space is contracted, the box whose inside stays as it is."""
+    """The box, outside of which space is empty. If space is contracted, the box whose inside is not contracted."""
     table: Float[Tensor, "entries features"]
     layout: HashGridLayout
     bias: float
-    """Added to the raw density, before the exponential."""
+    """Added to the raw density before the exponential."""
     density_weights: list[Tensor]
     color_weights: list[Tensor]
-    """Of the color's; its inputs are the density's outputs and what a ray's samples share. Empty: density only."""
+    """Weights of the color MLP; its inputs are the density MLP's outputs and what a ray's samples share. Empty: density
+    only."""
     ray_features: Callable[[RayBundle], Float[Tensor, "rays features"]]
-    """Return what all samples of a ray share: the features of its direction, and a photograph's code."""
+    """Returns what all samples of a ray share: the features of its direction, and a photograph's embedding."""
     least_slope: float = 0.0
-    """Of a color over its raw value on the way back from black or full, in training."""
+    """Minimum slope of a color over its raw value on the way back from black or full, in training."""
     contracted: bool = False
     """Whether all space, contracted around the box, is mapped to the unit cube (`geometry.contraction`)."""
     ray_features_learn: bool = False
-    """Whether there is anything to learn in `ray_features`."""
+    """Whether `ray_features` has anything to learn."""
 
     def handed_over(self, shared: int) -> int:
-        """Return how many outputs of the density are inputs of the colors, of which `shared` belong to the ray."""
+        """Return how many outputs of the density are inputs of the colors, besides the `shared` ones of the ray."""
         return self.color_weights[0].shape[1] - shared if self.color_weights else 0
 
     @property
     def weights(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Of both perceptrons."""
+        """Weights of both MLPs."""
         return self.density_weights, self.color_weights
 
 
 class WholeRays(NamedTuple):
-    """What a kernel saw along each ray."""
+    """What a kernel computed along each ray."""
 
     rgb: Float[Tensor, "rays 3"]
     """Sum of weights times color."""
@@ -66,7 +67,7 @@ class WholeRays(NamedTuple):
     depth: Float[Tensor, "rays"]
     """Sum of weights times distance."""
     samples: int
-    """That the field was evaluated at, in training; 0 in rendering."""
+    """Number of samples at which the field was evaluated in training; 0 in rendering."""
 
 
 def has_kernel(
@@ -75,10 +76,10 @@ def has_kernel(
     """Return whether there is a kernel for rays that march through a box.
 
     Args:
-        field: None: of a kind that no kernel knows.
+        field: the field's parts; None: no kernel supports it.
         matmul_precision: the precision of its products.
-        device: of its parameters, and the rays.
-        gradients: whether they are wanted, for the field's table and weights alone.
+        device: device of its parameters and the rays.
+        gradients: whether gradients are needed, for the field's table and weights only.
     """
     if field is None or field.contracted or (gradients and field.ray_features_learn):
         return False
@@ -86,7 +87,7 @@ def has_kernel(
 
 
 def has_dense_kernel(field: FieldParts | None, matmul_precision: MatmulPrecision, device: torch.device) -> bool:
-    """Return whether there is a kernel for rays with equally many samples; it has gradients for all that may learn.
+    """Return whether there is a kernel for rays with equal numbers of samples; it has gradients for all that may learn.
 
     The arguments are those of `has_kernel`.
     """
@@ -102,10 +103,10 @@ def render_samples(
     whole_from: float = 0.0,
     features: Float[Tensor, "samples features"] | None = None,
 ) -> Integrated | None:
-    """Return what is seen along rays, by a few kernels on CUDA, which have gradients for the field's table and weights.
+    """Return the integrals along rays by CUDA kernels, which have gradients for the field's table and weights.
 
-    None where there are no such kernels, or other gradients are wanted. `features` are of the field's grid at the
-    samples, where they have been computed before. The other arguments are those of `render_dense_rays`.
+    None if there are no such kernels, or other gradients are needed. `features` are those of the field's grid at the
+    samples, if already computed. The other arguments are those of `render_dense_rays`.
     """
     if field is None or not takes_samples(rays, field):
         return None
@@ -116,9 +117,9 @@ def render_samples(
 def sample_density(
     rays: RayBundle, samples: RaggedSamples, field: FieldParts | None, matmul_precision: MatmulPrecision
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]] | None:
-    """Return the density at samples, and the features of the field's grid there, without gradients.
+    """Return the density and the features of the field's grid at samples, without gradients.
 
-    None where `render_samples` returns None.
+    None if `render_samples` would return None.
     """
     if field is None or not takes_samples(rays, field):
         return None
@@ -127,7 +128,7 @@ def sample_density(
 
 
 def takes_samples(rays: RayBundle, field: FieldParts | None) -> bool:
-    """Return whether `render_samples` renders samples on these rays."""
+    """Return whether `render_samples` supports these rays."""
     if field is None or field.ray_features_learn or rays.near.dim() != 1:
         return False
     numbers = (rays.origins, rays.directions, field.table, *field.density_weights, *field.color_weights)
@@ -160,11 +161,11 @@ def render_whole_rays(
     Args:
         rays: unit directions.
         field: table and weights.
-        march: where each ray stands, and through what it goes.
+        march: each ray's state, and the grid it goes through.
         matmul_precision: the precision of the field's products.
-        opaque_below: a ray ends where less light is left.
+        opaque_below: a ray ends where its transmittance falls below this.
         least_alpha: in rendering, samples less opaque than this have no color.
-        samples_per_ray: how many are expected in training; None: render without gradients.
+        samples_per_ray: number expected in training; None: render without gradients.
     """
     kernels: Any = cpu_backend(RENDERING if samples_per_ray is None else LEARNING, rays.near.device)
     if samples_per_ray is None:
@@ -186,12 +187,12 @@ def render_dense_rays(
 
     Args:
         rays: unit directions.
-        edges: the intervals, in whose midpoints the field is asked.
+        edges: the intervals, at whose midpoints the field is evaluated.
         field: table and weights.
         matmul_precision: the precision of the field's products.
-        closed: whether the last interval takes all the light that is left.
-        whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
-        opaque_below: a sample behind which less light is left takes all of it, and ends its ray; 0: none does.
+        closed: whether the last interval absorbs all remaining light.
+        whole_from: gradients of samples nearer than this are scaled down (`rendering.near_gradients`); 0: of none.
+        opaque_below: a sample behind which less light is left absorbs it all, and ends its ray; 0: none does.
     """
     kernels: Any = cpu_backend(DENSE, rays.near.device)
     return kernels.render(rays, edges, field, _dtype(matmul_precision), closed, whole_from, opaque_below)

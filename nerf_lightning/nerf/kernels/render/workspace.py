@@ -1,4 +1,4 @@
-"""Memory for what the backward pass of whole rays needs; steps take it from one another, since fresh memory is slow."""
+"""Memory for the backward pass of whole rays; steps reuse it, since new memory is slow."""
 
 import os
 import threading
@@ -9,28 +9,28 @@ import torch
 from torch import Tensor
 
 NUMBERS = 8
-"""Of each sample (`render.quadrature`)."""
+"""Columns per sample (`render.compositing`)."""
 MOST_BYTES = 1 << 28
-"""Of what waits for a step to take it."""
+"""Maximum size of unused workspaces."""
 
 
 @dataclass
 class Workspace:
-    """What the forward pass leaves behind of some samples."""
+    """What the forward pass keeps of some samples."""
 
     owners: Tensor
-    """Number of each sample's ray; negative: none. Of rays with equally many samples the number of the sample among
+    """Index of each sample's ray; negative: none. For rays with equal numbers of samples, the sample's index among
     those of all rays."""
     numbers: Tensor
     points: Tensor
-    """In the unit cube."""
+    """Positions in the unit cube."""
     density_words: Tensor
-    """Inputs of all layers of the density's perceptron."""
+    """Inputs of all layers of the density MLP."""
     color_words: Tensor
 
     @classmethod
     def of(cls, rows: int, density_words: int, color_words: int) -> "Workspace":
-        """Return one for so many samples, with so many words for each."""
+        """Return a workspace for `rows` samples, with the given numbers of words per sample."""
         return cls(
             torch.empty(rows, dtype=torch.int32),
             torch.empty(rows, NUMBERS),
@@ -41,21 +41,21 @@ class Workspace:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Words per sample: those of one size may take each other's place."""
+        """Words per sample: workspaces of equal size are interchangeable."""
         return self.density_words.shape[1], self.color_words.shape[1]
 
     @property
     def rows(self) -> int:
-        """How many samples there is room for."""
+        """Number of samples there is room for."""
         return self.owners.shape[0]
 
     @property
     def bytes(self) -> int:
-        """How much memory it takes."""
+        """Memory it takes."""
         return sum(each.numel() * each.element_size() for each in self._tensors())
 
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """Return what the kernels take."""
+        """Return the arguments of the kernels."""
         return tuple(each.numpy() for each in self._tensors())
 
     def _tensors(self) -> tuple[Tensor, ...]:
@@ -67,7 +67,7 @@ _lock = threading.Lock()
 
 
 def take_workspace(rows: int, size: tuple[int, int]) -> Workspace:
-    """Return a workspace that nobody uses, for at least so many samples."""
+    """Return an unused workspace for at least `rows` samples."""
     with _lock:
         for number, spare in enumerate(_spare):
             if spare.size == size and spare.rows >= rows:
@@ -76,7 +76,7 @@ def take_workspace(rows: int, size: tuple[int, int]) -> Workspace:
 
 
 def give_back(workspaces: list[Workspace]) -> None:
-    """Let others use them; those that have waited longest are let go where there are too many."""
+    """Release workspaces for reuse; if too much memory is unused, the oldest are freed."""
     with _lock:
         _spare.extend(workspaces)
         while sum(each.bytes for each in _spare) > MOST_BYTES:
@@ -84,7 +84,7 @@ def give_back(workspaces: list[Workspace]) -> None:
 
 
 def forget_workspaces() -> None:
-    """Let go of all that nobody uses: there is no memory left."""
+    """Free all unused workspaces: memory has run out."""
     with _lock:
         _spare.clear()
 

@@ -17,7 +17,7 @@ BLOCK = 256
 def spherical_harmonics(
     directions: Float[Tensor, "*points 3"], degree: int
 ) -> Float[Tensor, "*points features"] | None:
-    """Return Y_lm of unit directions, l below `degree`; None where they are not float32, or gradients are wanted."""
+    """Return Y_lm of unit directions, l below `degree`; None if they are not float32, or gradients are needed."""
     if directions.dtype != torch.float32 or directions.requires_grad:
         return None
     count = directions.numel() // 3
@@ -28,7 +28,7 @@ def spherical_harmonics(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    """Run the kernel once on tiny input; it raises whatever the compiler or driver raises."""
     for degree in range(1, 5):
         found = spherical_harmonics(torch.ones(1, 3, device=device), degree)
         if found is None or not bool(found.isfinite().all()):

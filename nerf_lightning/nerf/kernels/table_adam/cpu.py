@@ -1,7 +1,7 @@
 """Adam's step for the CPU, in one pass, 16 numbers at a time.
 
-Most gradients of a hash grid are zero, and a vector of zeros costs no more than being read. LLVM makes no vectors of
-this loop by itself, since it is not told that the arrays lie apart.
+Most gradients of a hash grid are zero, and a vector of zeros is only read. LLVM does not vectorize this loop by itself,
+since it does not know that the arrays do not overlap.
 """
 
 from typing import Any, no_type_check
@@ -33,7 +33,7 @@ def adam_step(
     numbers = [np.float32(x) for x in (step_size, root_scale, *betas, eps)]
     vectors, rest = divmod(parameter.numel(), LANES)
     over_rows(_update_vectors, vectors, *arrays, *numbers)
-    if rest:  # as a vector of its own, filled up with zeros
+    if rest:  # in a separate vector, padded with zeros
         last = [np.zeros(LANES, np.float32) for _ in arrays]
         for vector, array in zip(last, arrays, strict=True):
             vector[:rest] = array[-rest:]
@@ -43,7 +43,7 @@ def adam_step(
 
 
 def trial() -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
+    """Run the kernel once on tiny input; it raises whatever the compiler raises."""
     adam_step(torch.ones(4), torch.ones(4), torch.zeros(4), torch.zeros(4), 0.1, 1.0, (0.9, 0.99), 1e-15)
 
 
@@ -52,7 +52,7 @@ def _update(
     context: Any, parameter: Any, grad: Any, first: Any, second: Any, step_size: Any, root_scale: Any, beta1: Any,
     beta2: Any, eps: Any,
 ) -> Any:  # fmt: skip
-    """Update the 16 numbers at some addresses where their gradients are not zero; those are set to zero."""
+    """Update 16 numbers where their gradients are nonzero, and set those gradients to zero."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         at = [pointer_to(builder, address, FLOATS) for address in arguments[:4]]

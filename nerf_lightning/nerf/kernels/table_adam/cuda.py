@@ -1,4 +1,4 @@
-"""Adam's step for CUDA: all parameters by one launch, in one pass. `TRITON_INTERPRET=1` runs it without a GPU."""
+"""Adam's step for CUDA: all parameters in one launch and one pass. `TRITON_INTERPRET=1` runs it without a GPU."""
 
 import functools
 from collections.abc import Sequence
@@ -30,9 +30,9 @@ def adam_steps(
 def _table(
     pointers: tuple[tuple[int, ...], ...], counts: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return addresses, first block and size of each parameter, and whose each block is.
+    """Return address, first block and size of each parameter, and the parameter of each block.
 
-    They stay on the device for as long as all lies where it did, which the arguments say.
+    They stay on the device as long as the addresses, which the arguments contain, do not change.
     """
     blocks = [triton.cdiv(count, BLOCK) for count in counts]
     first = [sum(blocks[:number]) for number in range(len(blocks))]
@@ -42,10 +42,10 @@ def _table(
 
 
 def trial(device: str = "cuda") -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler or driver raises.
+    """Run the kernel once on tiny input; it raises whatever the compiler or driver raises.
 
     Raises:
-        RuntimeError: it computes wrongly.
+        RuntimeError: the result is wrong.
     """
     parameter, grad, first, second = torch.tensor([[1.0, 1.0], [2.0, 0.0], [0.0, 3.0], [0.0, 4.0]], device=device)
     adam_steps([(parameter, grad, first, second)], 0.5, 1.0, (0.0, 0.0), 1e-15)

@@ -1,4 +1,4 @@
-"""One step of Adam on the entries whose gradient is not zero, which it sets to zero."""
+"""One step of Adam on the entries with nonzero gradient, which it sets to zero."""
 
 from collections.abc import Sequence
 
@@ -16,11 +16,11 @@ def adam_steps(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """Take the step of `adam_step_torch` for several parameters of one device: on CUDA by one kernel.
+    """Take the step of `adam_step_torch` for several parameters on one device; on CUDA in one kernel.
 
     Args:
         parameters: each with its gradient and its two moments.
-        step_size: see `adam_step_torch`, as of the others.
+        step_size: see `adam_step_torch`, also for the others.
         root_scale: the same for all parameters.
         betas: b1, b2.
         eps: keeps the quotient finite.
@@ -53,7 +53,7 @@ def adam_step_torch(
 
     Args:
         parameter: p.
-        grad: g; zero afterwards.
+        grad: g; set to zero.
         first: m.
         second: v.
         step_size: learning rate over (1 - b1^t).
