@@ -1,4 +1,4 @@
-"""The words of a command line: Hydra's own options, by Hydra's own parser, settings, and paths made overrides."""
+"""Split a command line into Hydra's own options, parsed by Hydra, and settings; turn paths into overrides."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,7 +13,7 @@ COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve"
 
 
 def options_first(arguments: Sequence[str], command: str = "train") -> list[str]:
-    """Return Hydra's options, each as one word, and after them the overrides, wherever they were typed.
+    """Return Hydra's options, each as one word, followed by the overrides, in whatever order they were typed.
 
     Raises:
         InputError: an option is unknown, or has no value or a wrong one.
@@ -47,7 +47,7 @@ def _refuse(message: str, arguments: Sequence[str], command: str) -> NoReturn:
 
 
 def require_settings(words: Sequence[str], or_paths: bool) -> None:
-    """Refuse words that are no setting, as spaces around a `=` leave them; `or_paths`: one without a `=` is a path."""
+    """Refuse words that are not settings, such as spaces around `=` leave; `or_paths`: one without `=` is a path."""
     bare = ["=" not in word and not word.startswith(("-", "~")) for word in words]
     for word, is_bare, before_bare in zip(words, bare, [*bare, False][1:], strict=True):
         if word.startswith("=") or (is_bare and not or_paths) or (word.endswith("=") and before_bare):
@@ -58,10 +58,10 @@ def require_settings(words: Sequence[str], or_paths: bool) -> None:
 
 
 def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
-    """Return the arguments with those that are paths gathered into `key=...`.
+    """Return the arguments with all paths gathered into `key=...`.
 
-    A path is what has no `=`, or what is there: the folders of a sweep's jobs are named `0_seed=0`. So is `ckpt=PATH`,
-    which other commands take.
+    An argument is a path if it has no `=` or if it exists: the folders of a sweep's jobs are named `0_seed=0`. So is
+    `ckpt=PATH`, which other commands take.
     """
     arguments = arguments if key == "ckpt" else [word.removeprefix("ckpt=") for word in arguments]
     paths = [
@@ -69,7 +69,7 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
     ]
     if not paths:
         return arguments
-    from nerf_lightning.config.overrides import quoted  # brings Hydra
+    from nerf_lightning.config.overrides import quoted  # imports Hydra
 
     if len(paths) > 1 and not several:
         raise InputError(f"{key} takes one folder, but {len(paths)} were given: {', '.join(paths)}.")

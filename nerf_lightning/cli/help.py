@@ -1,7 +1,7 @@
 """`nerf help`, `nerf COMMAND --help` and `nerf completion`: answered from conf/ and docstrings, without Hydra.
 
-Hydra has scripts for completion, too. They compose the config at each press of the key, which takes seconds, and know
-neither our commands nor what a setting takes.
+Hydra has completion scripts, too, but they compose the config at each key press, which takes seconds, and know neither
+our commands nor the values of a setting.
 """
 
 import re
@@ -18,11 +18,11 @@ from nerf_lightning.messages.escaping import terminal_width
 FLAGS = ("-h", "--help")
 WIDEST = 120
 SCRIPTS = Path(__file__).parent / "completions"
-CANDIDATES = "candidates"  # What the scripts ask for, with the words that have been typed
+CANDIDATES = "candidates"  # The request of the scripts, followed by the words typed so far
 
 
 def help_on(name: str, arguments: list[str]) -> str:
-    """Return the help of a command; with words such as `scene=colmap` or `trainer.max_steps` behind --help, theirs."""
+    """Return the help of a command, or of words such as `scene=colmap` or `trainer.max_steps` that follow --help."""
     asked = max((place for place, word in enumerate(arguments) if word in FLAGS), default=-1)
     words = [word for word in arguments[asked + 1 :] if not word.startswith("-")]
     if not words:
@@ -31,7 +31,7 @@ def help_on(name: str, arguments: list[str]) -> str:
 
 
 def help_on_anything(words: list[str], commands: list[str]) -> str:
-    """Return the help of what words name: a command, or parts and settings of the first command that has them."""
+    """Return the help of the words: a command, or the parts and settings of the first command that has them."""
     if words[0] in commands:
         return help_on(words[0], words[1:])
     pages = [_in_every_command(word, commands) for word in words]
@@ -46,7 +46,7 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
 
 
 def _in_every_command(word: str, commands: list[str]) -> str:
-    """Return what a word means in training; if it has no meaning there, in each other command."""
+    """Return the help of a word in training; if it has no meaning there, in each other command."""
     pages = {name: page_of(_command(name), word, _width()) for name in commands}
     told = {page: name for name, page in pages.items() if page}
     if len(told) < 2 or pages["train"]:
@@ -75,7 +75,7 @@ def _width() -> int:
 
 
 def completion(arguments: list[str], commands: list[str]) -> str:
-    """Return the script of a shell; or, as the scripts ask for it, what the last of some words may become."""
+    """Return a shell's completion script, or, when called by a script, the completions of the last word."""
     if arguments[:1] == [CANDIDATES]:
         return "\n".join(candidates(arguments[1:], commands))
     shell = arguments[0] if arguments else ""

@@ -1,4 +1,4 @@
-"""Start in less time: imports without the collector of cycles and without scipy.signal, and one composition.
+"""Start faster: import without garbage collection and without scipy.signal, and compose the config once.
 
 Each saves a quarter of a second or more; `process.py` saves another second at the end.
 """
@@ -14,12 +14,12 @@ from typing import Any
 
 SIGNALS = "scipy.signal"
 MAY_SET_A_MODE = ("hydra.mode", "hydra/mode", "hydra.searchpath")
-"""Settings, after any sign of Hydra's, that set the mode or name folders of the user's whose files may."""
-OTHER_FILES = "--config-"  # How Hydra's options for such folders and files begin
+"""Settings, after any prefix of Hydra's, that set the mode or name user folders whose files may set it."""
+OTHER_FILES = "--config-"  # The prefix of Hydra's options for such folders and files
 
 
 def announce_start(command: str, arguments: list[str]) -> None:
-    """Say at a terminal at once that a command has started, unless an option of Hydra's asks for something brief."""
+    """Announce at once on a terminal that a command has started, unless a Hydra option asks for brief output."""
     brief = any(word.startswith("-") and word not in ("-m", "--multirun", "-v", "--verbose") for word in arguments)
     if "torch" not in sys.modules and not brief and sys.stderr is not None and sys.stderr.isatty():
         print(f"starting nerf {command}; loading PyTorch takes a few seconds", file=sys.stderr, flush=True)
@@ -27,11 +27,11 @@ def announce_start(command: str, arguments: list[str]) -> None:
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Let the collector of cycles rest during imports: what is imported stays, half a million objects to walk through.
+    """Disable the garbage collector during imports: what is imported stays, half a million objects to traverse.
 
-    Later it passes them over, too, but for the end of the process: libraries in C++ complain of what is left then.
+    Later collections skip these objects, too, except at exit: C++ libraries complain about objects that are left then.
     """
-    if "lightning" in sys.modules:  # the second job of a sweep: nothing heavy is left, and there may be work to collect
+    if "lightning" in sys.modules:  # the second job of a sweep: no heavy imports are left, and there may be garbage
         yield
         return
     was_on = gc.isenabled()
@@ -47,12 +47,12 @@ def quick_imports() -> Iterator[None]:
 
 
 class _Later(ModuleType):
-    """Stands for a module until something other than `hamming` is asked of it."""
+    """Stand in for a module until an attribute other than `hamming` is accessed."""
 
     hamming = None
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # inspect looks at every module's __file__
+        if name.startswith("__"):  # inspect reads every module's __file__
             raise AttributeError(name)
         if sys.modules.get(self.__name__) is self:
             del sys.modules[self.__name__]
@@ -61,7 +61,7 @@ class _Later(ModuleType):
 
 @contextmanager
 def _signals_later() -> Iterator[None]:
-    """Leave out scipy.signal, an eighth of all: torchmetrics only looks whether a name of its is there."""
+    """Defer scipy.signal, an eighth of the import time: torchmetrics only checks that one of its names exists."""
     if SIGNALS in sys.modules:
         yield
         return
@@ -74,9 +74,9 @@ def _signals_later() -> Iterator[None]:
 
 
 def compose_once() -> None:
-    """Let Hydra 1.3 compose a command's config once: it would compose it a first time only to look for `hydra.mode`.
+    """Make Hydra 1.3 compose a command's config once: it would compose it a first time only to look up `hydra.mode`.
 
-    No yaml in conf/ sets one, so it matters only where files of the user are read. Hydra 1.4 does so by itself.
+    No YAML in conf/ sets it, so it matters only if files of the user are read. Hydra 1.4 composes once by itself.
     """
     from hydra._internal.hydra import Hydra
 

@@ -56,7 +56,7 @@ MOST_LETTERS = 5000
 def main() -> None:
     """Run the command line."""
     with explained("COMMAND"):
-        # A script that was edited on Windows ends its lines, and with them arguments, with a CR.
+        # In a script that was edited on Windows, lines, and thus arguments, end with a CR.
         _answer([word.rstrip("\r") for word in sys.argv[1:] if word != "\r"])
 
 
@@ -105,13 +105,13 @@ def command_module(name: str) -> ModuleType:
 
 
 def _command_files() -> dict[str, Path]:
-    """Return the files in commands/, ours and extensions', each of which has a yaml of its name in conf/."""
+    """Return the files in commands/, ours and those of extensions; each has a YAML of the same name in conf/."""
     files = [*PACKAGE.glob("extensions/*/commands/*.py"), *PACKAGE.glob("commands/*.py")]
     return {file.stem: file for file in files if conf_file(file.stem).is_file()}
 
 
 def _summary(file: Path) -> str:
-    # Read, not imported: an import would cost seconds.
+    # Read, not imported: an import would take seconds.
     docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
     return docstring.partition("\n")[0]
 
@@ -128,10 +128,10 @@ def _run(command: str, arguments: list[str]) -> None:
     """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
     require_no_settings_here()
     announce_start(command, arguments)
-    # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
-    # Read by GNU's OpenMP when torch is loaded.
+    # Otherwise, torch's threads spin for some milliseconds after each operation and block the kernels' threads. GNU's
+    # OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    # Hydra would print its own short traceback and exit with 1; we want the exceptions.
+    # By default, Hydra prints its own short traceback and exits with 1; we want the exceptions.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
@@ -140,7 +140,7 @@ def _run(command: str, arguments: list[str]) -> None:
         # torch and Lightning take seconds, and --help needs neither.
         with explained(command), quick_imports():
             module = command_module(command)
-        # A job of a sweep may be in another process than the command line was read in.
+        # A job of a sweep may run in another process than the one that read the command line.
         set_limits(Budgets(**config.budgets))
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             from nerf_lightning.runs.sweep_job import run_job
@@ -181,7 +181,7 @@ def _setting_of(word: str) -> str:
 
 @contextmanager
 def explained(command: str) -> Iterator[None]:
-    """Turn bad input into one paragraph and exit code 2; end quietly where nobody reads what is printed."""
+    """Turn bad input into one paragraph and exit code 2; exit quietly if the reader of the output has left."""
     try:
         with ends_quietly():
             yield
@@ -197,7 +197,7 @@ def explained(command: str) -> Iterator[None]:
 
 
 def _complain(message: str) -> None:
-    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
-    # Libraries say some things in several lines.
+    # Names from files may contain anything: none of their escape sequences reaches the terminal, and none of their
+    # lines looks like ours. Some messages of libraries have several lines.
     print(f"nerf: {for_terminal(message.replace(chr(10), ' '), MOST_LETTERS)}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -1,6 +1,6 @@
-"""What a command adds to its arguments before Hydra composes them: what a run or a checkpoint remembers.
+"""Add what a run or a checkpoint remembers to a command's arguments before Hydra composes them.
 
-Everything heavy is imported late: `--help` needs none of it.
+Heavy modules are imported late: `--help` needs none of them.
 """
 
 import logging
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 def prepared(command: str, arguments: list[str]) -> list[str]:
-    """Return a command's arguments with what belongs before them; the user's own come last, and win."""
+    """Return a command's arguments, preceded by the remembered ones; the user's own come last and take precedence."""
     if command in PATHS_ALONE:
         key = PATHS_ALONE[command]
         arguments = named_paths(arguments, key, several=key == "runs")
@@ -26,7 +26,7 @@ def prepared(command: str, arguments: list[str]) -> list[str]:
 
 
 def _train(arguments: list[str]) -> list[str]:
-    """Repeat the overrides that a run was started with where it is resumed by name; let Lightning's arguments in."""
+    """Repeat a run's original overrides if it is resumed by name; accept Lightning's arguments."""
     _refuse_second_sweep(arguments)
     resumed = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     from nerf_lightning.config.overrides import open_sections
@@ -53,7 +53,7 @@ def _refuse_second_sweep(arguments: list[str]) -> None:
 
 
 def _eval(arguments: list[str]) -> list[str]:
-    """Name the run's own scene where the user names none, so that the checkpoint is enough.
+    """Add the run's own scene if the user names none, so that the checkpoint suffices.
 
     The scene's class comes from our conf/, by the name that the checkpoint recorded; only plain values (paths, sizes,
     background) are taken from the file.
@@ -72,7 +72,7 @@ def _eval(arguments: list[str]) -> list[str]:
 
 
 def _view(arguments: list[str]) -> list[str]:
-    """Name the run's own scene as for `eval`; without it, cameras are shown without photographs, unless wished for."""
+    """Add the run's own scene as for `eval`; without it, show cameras without photographs unless they are requested."""
     wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
     if "true" in map(str.lower, wished[-1:]):
         return _eval(arguments)
@@ -81,7 +81,7 @@ def _view(arguments: list[str]) -> list[str]:
 
 
 def _export(arguments: list[str]) -> list[str]:
-    """Name the run's own scene as for `eval` where the exporter needs photographs; where it is unknown, do without."""
+    """Add the run's own scene as for `eval` if the exporter needs photographs; if it is unknown, do without."""
     typed = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
     with quick_imports():
         from nerf_lightning.config.exporters import exporter_class
@@ -93,14 +93,14 @@ def _export(arguments: list[str]) -> list[str]:
             typed = [str(dict(command.groups)["what"])]
         name = typed[-1]
         exporter = exporter_class(name)
-    # Nothing is known here of an exporter of a person's own: it may need them.
+    # The user's own exporter is unknown here: it may need photographs.
     if exporter is not None and not getattr(exporter, "needs_photographs", False):
         return arguments
     return _eval_or_without(arguments, ["photographs=false"], f"what={name} does not use photographs")
 
 
 def _eval_or_without(arguments: list[str], without: list[str], said: str) -> list[str]:
-    """Name the run's own scene as for `eval`; where it is unknown, say so (nothing, if empty) and do without."""
+    """Add the run's own scene as for `eval`; if it is unknown, log `said` (unless empty) and do without."""
     try:
         return _eval(arguments)
     except InputError as error:
@@ -114,7 +114,7 @@ def _eval_or_without(arguments: list[str], without: list[str], said: str) -> lis
 
 
 def _report(arguments: list[str]) -> list[str]:
-    """Name the run's own scene where the user names none."""
+    """Add the run's own scene if the user names none."""
     given = dict(argument.partition("=")[::2] for argument in arguments)
     if "run" not in given or "scene" in given or given.get("doctor", "").lower() == "false":
         return arguments
@@ -136,4 +136,4 @@ PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
 }
 
 PATHS_ALONE = {"table": "runs", "report": "run", **dict.fromkeys(("eval", "render", "view", "export"), "ckpt")}
-"""Commands that take paths without a key, and the setting that these are."""
+"""Commands that accept paths without a key, and the setting that such paths fill."""

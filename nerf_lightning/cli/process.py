@@ -1,9 +1,9 @@
-"""How `nerf` starts and ends.
+"""Start and end the `nerf` process.
 
-What lies in the working directory is data: `nerf` may be called in a folder that somebody else made. Python looks for
-modules there first when it is started with `-m` or `-c`, as launchers, pools of processes and compilers start it.
+Files in the working directory are data: `nerf` may be called in a folder made by someone else. Python searches it for
+modules first when started with `-m` or `-c`, as launchers, process pools and compilers do.
 
-At the end nothing that was loaded is taken apart, which takes a second, and nothing is said if the reader left.
+At exit, nothing that was loaded is torn down, which would take a second, and nothing is printed if the reader has left.
 """
 
 import atexit
@@ -22,17 +22,17 @@ from nerf_lightning.messages.errors import InputError
 FAILED = 1
 BAD_INPUT = 2
 READER_LEFT = 141
-"""128 + SIGPIPE, what a shell says of `yes` too; a sweep takes it for a stop, not for a job that failed."""
+"""128 + SIGPIPE, as a shell reports for `yes`; a sweep treats it as a stop, not as a failed job."""
 STDOUT, STDERR = 1, 2
 SETTINGS = {
     ".numba_config.yaml": "numba, whose settings can be given as variables (NUMBA_...)",
     "matplotlibrc": "matplotlib, which also reads ~/.config/matplotlib/matplotlibrc",
 }
-"""Files that libraries look for in the working directory, and no variable of theirs keeps them from it."""
+"""Files that libraries read from the working directory, which no environment variable prevents."""
 
 
 def main() -> None:
-    """Run the command line, and end."""
+    """Run the command line and exit."""
     with quick_end():
         from nerf_lightning.cli.main import main as answer
 
@@ -45,15 +45,15 @@ def main() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt for the first Ctrl-C; the next one ends the process at once, whatever it waits for."""
+    """Raise KeyboardInterrupt for the first Ctrl-C; the next one ends the process at once, whatever blocks it."""
     signal.signal(number, signal.SIG_DFL)
     raise KeyboardInterrupt
 
 
 def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    if unraisable.exc_type is KeyboardInterrupt:  # in a callback of llvmlite, say, which would go on
+    if unraisable.exc_type is KeyboardInterrupt:  # in a callback of llvmlite, say, which would continue
         signal.raise_signal(signal.SIGINT)
-    if unraisable.exc_type is MemoryError:  # in scikit-image's marching cubes, which would go on for ever
+    if unraisable.exc_type is MemoryError:  # in scikit-image's marching cubes, which would continue forever
         print(
             "nerf: Not enough memory: a library got none. Use a smaller model, picture or resolution.", file=sys.stderr
         )
@@ -62,16 +62,16 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def was_interrupted() -> bool:
-    """Return whether there was a Ctrl-C; a library in which it is raised may turn it into an error of its own."""
+    """Return whether Ctrl-C was pressed; a library that it interrupts may turn it into an error of its own."""
     return signal.getsignal(signal.SIGINT) is signal.SIG_DFL
 
 
 @contextmanager
 def quick_end() -> Iterator[None]:
-    """End this process after the block: nothing that Python has loaded is taken apart.
+    """End this process after the block without tearing down what Python has loaded.
 
-    Threads are waited for, and what is registered for the end is done, as ever. An error that nobody has caught, or a
-    stream that cannot be flushed, is Python's to tell: then it ends as it would without this.
+    Threads are joined and exit handlers run, as usual. Python reports uncaught errors and streams that cannot be
+    flushed; the process then ends as it would without this.
     """
     try:
         yield
@@ -90,10 +90,10 @@ def _exit_code(stop: SystemExit) -> int:
 
 
 def _end(code: int) -> None:
-    # All is written: a further Ctrl-C ends the process at once, instead of as a traceback of what runs at the end.
+    # All is written: a further Ctrl-C ends the process at once, without a traceback from an exit handler.
     if callable(signal.getsignal(signal.SIGINT)):  # not where it is ignored, as in jobs in the background
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # What multiprocessing does at the end of its processes.
+    # As multiprocessing does at the end of its processes.
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     try:
@@ -107,10 +107,10 @@ def _end(code: int) -> None:
 
 @contextmanager
 def ends_quietly() -> Iterator[None]:
-    """Exit with READER_LEFT, without a word, where nobody reads what is printed any more.
+    """Exit silently with READER_LEFT if nothing reads the output any more.
 
     Raises:
-        OSError: what was printed cannot be written for another reason, such as a full disk.
+        OSError: the output cannot be written for another reason, such as a full disk.
     """
     try:
         try:
@@ -120,7 +120,7 @@ def ends_quietly() -> Iterator[None]:
             raise
         _flush()
     except BrokenPipeError:
-        # The pipe may be another one: to a worker, to a film's encoder. That is told like any error.
+        # The pipe may be another one: to a worker, to a film's encoder. That is reported like any error.
         unread = _without_reader()
         if not unread:
             raise
@@ -136,7 +136,7 @@ def ends_quietly() -> Iterator[None]:
 
 
 def _flush() -> None:
-    # What waits in the buffer would fail at the interpreter's end, where nobody can catch it.
+    # Buffered output would fail at interpreter exit, where nothing can catch the error.
     if sys.stdout is not None:
         sys.stdout.flush()
 
@@ -151,14 +151,14 @@ def _without_reader() -> list[int]:
 
 
 def _silence(descriptor: int) -> None:
-    """Let what is still buffered go nowhere: Python flushes at its end again, and would complain."""
+    """Discard what is still buffered: Python flushes again at exit and would complain."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)
 
 
 def write_any_name() -> None:
-    """Let names that the encoding of a stream lacks be written as Python writes them, here and in subprocesses."""
+    """Write names that a stream cannot encode with backslash escapes, here and in subprocesses."""
     encoding = os.environ.get("PYTHONIOENCODING", "").partition(":")[0]
     os.environ["PYTHONIOENCODING"] = f"{encoding}:backslashreplace"
     for stream in (sys.stdout, sys.stderr):
@@ -167,9 +167,9 @@ def write_any_name() -> None:
 
 
 def keep_from_subprocesses() -> None:
-    """Let the Python processes that this one starts, directly or through libraries, import nothing from there."""
+    """Keep Python processes that this one or its libraries start from importing from the working directory."""
     os.environ["PYTHONSAFEPATH"] = "1"
-    # A clone that is not installed was found there itself.
+    # A clone that is not installed was itself found there.
     clone = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     if clone not in sys.path:
         sys.path.append(clone)
@@ -177,7 +177,7 @@ def keep_from_subprocesses() -> None:
 
 
 def require_no_settings_here() -> None:
-    """Refuse to start where a library would obey a file of the working directory."""
+    """Refuse to start if a library would obey a file in the working directory."""
     for name, library in SETTINGS.items():
         if os.path.lexists(name):
             raise InputError(

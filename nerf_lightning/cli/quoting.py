@@ -1,7 +1,7 @@
-"""Paths as they are typed, quoted for Hydra where they have `=`, commas, spaces, brackets or letters beyond ASCII.
+"""Quote paths for Hydra if they contain `=`, commas, spaces, brackets or non-ASCII letters.
 
-What exists is a path, and so is the value of a setting with the name of one (`PATH_KEY`), unless it is written in
-Hydra's syntax. In a sweep the commas of a path that does not exist separate several.
+A value is a path if it exists or if its setting is named like a path (`PATH_KEY`), unless it is written in Hydra's
+syntax. In a sweep, commas in a path that does not exist separate several paths.
 """
 
 import os
@@ -9,14 +9,14 @@ import re
 
 PATH_KEY = re.compile(r"[+]*([\w.]+\.)?(root|images|video|checkpoint|ckpt|run|resume|init_from|\w+_(dir|file))")
 OF_HYDRA = re.compile(r"""(['"]).*\1|\[.*\]|\{.*\}|.*(\$\{|\\[][(){}:=,\s]).*""")
-"""A text in quotes, a list, a dictionary, an interpolation, an escaped character."""
+"""Matches a quoted text, a list, a dictionary, an interpolation, an escaped character."""
 SWEEP = re.compile(r""".*['"].*|(choice|glob|interval|range|shuffle|sort|tag)\(.*\)""")
-"""What lists values in another way than by commas alone."""
+"""Matches lists of values that are not separated by commas alone."""
 QUOTED = re.compile(r"""(['"])((?:(?!\1)[^\\]|\\.)*)\1""")
 
 
 def quoted_paths(arguments: list[str], sweep: bool) -> list[str]:
-    """Return the arguments with quotes around the paths that Hydra would not read as they are.
+    """Return the arguments with quotes around the paths that Hydra would misread.
 
     >>> quoted_paths(["scene.root=my fox (1)", "seed=0"], sweep=False)
     ["scene.root='my fox (1)'", 'seed=0']
@@ -35,7 +35,7 @@ def _quoted_path(word: str, sweep: bool) -> str:
         return f"{key}={_readable(value, named)}"
     if not named or OF_HYDRA.fullmatch(value):
         return word
-    if not sweep or key.startswith("paths."):  # which are of the sweep, not of a job
+    if not sweep or key.startswith("paths."):  # which belong to the sweep, not to a job
         return f"{key}={_readable(value, named)}"
     if SWEEP.fullmatch(value):
         return word
@@ -43,7 +43,7 @@ def _quoted_path(word: str, sweep: bool) -> str:
 
 
 def _readable(path: str, is_text: bool) -> str:
-    from nerf_lightning.config.overrides import PLAIN, quoted  # brings Hydra
+    from nerf_lightning.config.overrides import PLAIN, quoted  # imports Hydra
 
     return path if PLAIN.fullmatch(path) and not (is_text and _is_number(path)) else quoted(path)
 
@@ -57,7 +57,7 @@ def _is_number(text: str) -> bool:
 
 
 def unquoted(value: str) -> str:
-    r"""Return a value without the quotes around the whole of it.
+    r"""Return a value without the quotes that enclose all of it.
 
     >>> unquoted("'it\\'s'"), unquoted("'a','b'"), unquoted("a,b")
     ("it's", "'a','b'", 'a,b')

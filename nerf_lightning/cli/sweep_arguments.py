@@ -1,4 +1,4 @@
-"""The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
+"""Arguments of a sweep: its folder, a folder per job named after the swept values, its original arguments."""
 
 import shutil
 from collections.abc import Iterator
@@ -24,10 +24,10 @@ def is_sweep(arguments: list[str]) -> bool:
 
 
 def sweep_arguments(arguments: list[str]) -> list[str]:
-    """Return the arguments of a sweep with its folders named; those of a single run come back as they are.
+    """Return the arguments of a sweep with its folders added; those of a single run are returned unchanged.
 
-    `paths.output_dir` names the folder of the whole sweep, and each job's folder says the values that are swept.
-    With `sweep.resume=true` what the sweep was started with comes first.
+    `paths.output_dir` names the folder of the whole sweep, and each job's folder is named after the swept values. With
+    `sweep.resume=true`, the sweep's original arguments come first.
 
     >>> sweep_arguments(["-m", "seed=0,1", "paths.output_dir=out"])
     ['-m', 'seed=0,1', 'hydra.sweep.dir=out', 'hydra.sweep.subdir=\\'${file_name:"${hydra.job.num}_seed=${seed}"}\\'']
@@ -45,7 +45,7 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     from nerf_lightning.config.hydra_versions import SWEEPS_REMOVE, register_resolver
     from nerf_lightning.files.made_folders import file_name
 
-    register_resolver("file_name", file_name)  # Hydra hands it to the jobs
+    register_resolver("file_name", file_name)  # Hydra passes it to the jobs
     # Hydra reads -m only before the overrides.
     arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
     removed = [word for word in arguments if word.startswith("~") and "=" not in word]
@@ -57,14 +57,14 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
     current = {key: f"hydra.runtime.choices.{key}" if option_names(key) else key for key in _swept(arguments)}
     parts = ["${hydra.job.num}", *(f"{key}=${{{value}}}" for key, value in current.items())]
-    # A value may hold anything, and may be from the sweep's folder: no job's folder lies deeper, or elsewhere.
+    # A value may contain anything, and may be from the sweep's folder: no job's folder is deeper, or elsewhere.
     name = (_value(arguments, JOB_FOLDER) or "_".join(parts)).replace("'", "").replace('"', "")
     others = [argument for argument in renamed if not argument.startswith(f"{JOB_FOLDER}=")]
     return [*others, f"{JOB_FOLDER}='${{file_name:\"{name}\"}}'"]
 
 
 def _with_former(arguments: list[str], resuming: bool) -> list[str]:
-    """Put what the sweep was started with before the user's own."""
+    """Prepend the sweep's original arguments to the user's own."""
     from nerf_lightning.compute.slurm import was_requeued
     from nerf_lightning.files.made_folders import require_no_way_out
 
@@ -107,7 +107,7 @@ def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
 
 
 def _sweeps(arguments: list[str]) -> Iterator[tuple[Path, "SweepRecord"]]:
-    """Yield the folders of former sweeps, the newest first, each with its record; damaged ones are left out."""
+    """Yield the folders of earlier sweeps, newest first, each with its record; skip damaged ones."""
     from nerf_lightning.runs.sweep_record import read_sweep
 
     root = Path(_value(arguments, "paths.root_dir") or "outputs") / "sweeps"

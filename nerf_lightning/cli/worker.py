@@ -1,7 +1,7 @@
 """One of several processes that `nerf` has started: `python -m nerf_lightning.cli.worker COMMAND FOLDER LAUNCHER`.
 
-The folder holds the config that the first process composed, and Hydra's; the command line is not repeated. LAUNCHER is
-the number of that process.
+The folder contains the config that the first process composed, and Hydra's; the command line is not repeated. LAUNCHER
+is the ID of that process.
 """
 
 import json

@@ -26,11 +26,11 @@ from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
 
 STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red", "not judged": "dim"}
-UNWRAPPED = 10_000  # Columns where there is no terminal: lines stay whole, to be searched.
+UNWRAPPED = 10_000  # Columns without a terminal: lines are not wrapped, so that they can be searched.
 
 
 def run(config: DictConfig) -> int:
-    """Do what the config says; return the number of checks whose verdict is `wrong`."""
+    """Run the checks and return how many have the verdict `wrong`."""
     started = time.monotonic()
     reader = build(config.scene)
     scene = reader.read()
@@ -60,7 +60,7 @@ def run(config: DictConfig) -> int:
 
 
 def _origin(config: DictConfig, reader: Any) -> tuple[str | None, str]:
-    """Return where the capture lies, and how scene= names its format."""
+    """Return the capture's path, and the name of its format for scene=."""
     form = HydraConfig.get().runtime.choices["scene"]
     if isinstance(reader, AutoReader):
         known = reader.known_format(reader.folder())
@@ -81,7 +81,7 @@ def summary(checks: Sequence[Check]) -> str:
 
 
 def print_checks(checks: Sequence[Check]) -> None:
-    """Print a line per check, what is wrong with its cure below."""
+    """Print a line per check; the cure of a problem is below it."""
     console = StdoutConsole(highlight=False, soft_wrap=True)
     width = max(len(check.name) for check in checks)
     lines = TextWrapper(terminal_width(UNWRAPPED), subsequent_indent=" " * (width + 14), break_long_words=False)

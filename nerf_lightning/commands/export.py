@@ -49,12 +49,12 @@ def run(config: DictConfig) -> None:
 
 
 def export(config: DictConfig) -> list[Path]:
-    """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
+    """Export a checkpoint, which is all that is needed. Only one process exports, however many there are."""
     if not ranks.is_first():
         return []
     what: Export = build_exporter(config, str(HydraConfig.get().runtime.choices.get("what")))
     path = build(config.path) if what.plays_path else None
-    # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
+    # In float32, whatever the training precision: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
     if what.needs_density:
         point_field(opened.model)
@@ -71,7 +71,7 @@ def export(config: DictConfig) -> list[Path]:
 def write_files(
     what: Export, opened: LoadedModel, photographs: Scene | None, path: CameraPath | None, folder: Path
 ) -> list[Path]:
-    """Export an opened model into a folder, which is there, and return the files."""
+    """Export an opened model into an existing folder and return the files."""
     record = opened.checkpoint.scene
     content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
     run = run_context(opened, photographs, path if what.plays_path else None, content)
@@ -87,7 +87,7 @@ def run_context(
     path: CameraPath | None,
     content: Content,
 ) -> RunContext:
-    """Return what is known of a checkpoint's run: its photographs, its metrics, and a camera path."""
+    """Return what is known about a checkpoint's run: its photographs, its metrics, and a camera path."""
     checkpoint = opened.checkpoint
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
@@ -103,7 +103,7 @@ def run_context(
 
 
 def neutral_colors(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Neutral:
-    """Return what takes photographs to the colors that a model shows, whose correction has learned how they differ."""
+    """Return the function that maps photographs to the model's colors, by its learned correction."""
     if not checkpoint.correction:  # Pruned checkpoints keep the model alone.
         return lambda rgb, name: None
     correction, scene = load_correction(checkpoint, trusted), checkpoint.scene
@@ -124,7 +124,7 @@ def page_path(
     run: Path,
     content: Content = PathFrame.content,
 ) -> Keyframes:
-    """Return the keyframes of a path; of path=auto, those that `nerf view` saved last in the run's folder, if any."""
+    """Return the keyframes of a path; for path=auto, those last saved by `nerf view` in the run's folder, if any."""
     around = frame_around(record, content)
     if not isinstance(path, AutoPath):
         return tuple(map(asdict, as_keyframes(path, around)))

@@ -1,6 +1,6 @@
 """Find the cameras of photographs or of a video by structure from motion.
 
-Written is a folder that `scene=colmap` reads.
+The output is a folder that `scene=colmap` reads.
 """
 
 import time
@@ -22,7 +22,7 @@ from nerf_lightning.video.encoding import require_ffmpeg
 
 
 def run(config: DictConfig) -> int:
-    """Find the poses as the config says, print what was found, and return how many."""
+    """Find the poses as configured, print a summary, and return their number."""
     started = time.monotonic()
     source, settings = _source(config), _settings(config)
     require_pycolmap()

@@ -26,7 +26,7 @@ def run(config: DictConfig) -> None:
 
 
 def render(config: DictConfig) -> None:
-    """Film one checkpoint, or several side by side; they are all that is needed, but by models of many scenes."""
+    """Film one checkpoint, or several side by side; only models of many scenes need more than their checkpoints."""
     plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     shown = film_settings(plain)
     path = build(config.path)
@@ -46,7 +46,7 @@ def render(config: DictConfig) -> None:
 
 
 def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
-    """Return the scene that a model renders: its own, or for models that look at photographs the one that is named."""
+    """Return the scene that a model renders: its own, or, for models that render from photographs, the named one."""
     if opened.model.needs_photographs:
         return scene_record(scene_to_look_at(opened, scene))
     if scene is not None:
@@ -58,7 +58,7 @@ def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
 
 
 def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
-    """Return what checkpoints are called beside each other: as given, else after their run folders."""
+    """Return labels for checkpoints shown side by side: as given, or else from their run folders."""
     if given is None:
         paths = [checkpoint.path.absolute() for checkpoint in checkpoints]
         names = [path.parents[1].name if path.parent.name == "checkpoints" else path.stem for path in paths]

@@ -19,7 +19,7 @@ from nerf_lightning.runs.results import FILES
 
 
 def run(config: DictConfig) -> str:
-    """Do what the config says; return where the page is."""
+    """Write the report and return the path of the page."""
     require_one_of(FILES, measured=config.measured)
     run = Path(str(config.run))
     if not (run / "run.json").is_file():
@@ -39,6 +39,6 @@ def run(config: DictConfig) -> str:
 
 def _examine_capture(config: DictConfig) -> list[Check]:
     if config.get("scene") is None:
-        # The run's own scene could not be taken from its checkpoint: this says why.
+        # The run's own scene could not be read from its checkpoint: this says why.
         scene_overrides(str(Path(str(config.run)) / "checkpoints" / "last.ckpt"))
     return examine(build(config.scene).read())[1]

@@ -30,10 +30,10 @@ FLAGS = re.compile(r"\b(sse4_2|avx|avx2|fma|avx512\w*|avx_\w+|amx\w*|asimd\w*|bf
 
 
 def run(config: DictConfig) -> None:
-    """Check what the config's trainer chooses, print a table, write selftest.json.
+    """Check what the configured trainer would use, print a table and write selftest.json.
 
     Raises:
-        InputError: the device is neither a CPU nor a GPU of CUDA.
+        InputError: the device is neither a CPU nor a CUDA GPU.
         SystemExit: something is wrong (exit code 1).
     """
     began = time.perf_counter()
@@ -82,7 +82,7 @@ def _in_words(value: object) -> str:
 
 
 def machine(device: torch.device) -> dict[str, Any]:
-    """Return what a bug report should say of this machine, beside the versions of libraries."""
+    """Return what a bug report should say about this machine, besides library versions."""
     known: dict[str, Any] = {
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "cpu_flags": " ".join(sorted(set(FLAGS.findall(collect_env.get_cpu_info(collect_env.run))))) or "unknown",

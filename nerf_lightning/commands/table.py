@@ -21,7 +21,7 @@ TEMPLATE = PACKAGE / "report" / "table.html"
 
 
 def run(config: DictConfig) -> int:
-    """Do what the config says; return the number of rows."""
+    """Write the table and return the number of rows."""
     require_one_of(FILES, measured=config.measured)
     require_one_of(ORDERS, sort=config.sort)
     folders = [Path(name) for name in _names(config.runs)]
@@ -42,7 +42,7 @@ def run(config: DictConfig) -> int:
 
 
 def _write(rows: list[Row], notes: list[str], title: str, out: Path, protocol: dict[str, Any]) -> list[Path]:
-    """Write the file that was asked for, or one of each kind into a folder; return where."""
+    """Write the requested file, or one of each kind into a folder; return the paths."""
     is_file = out.suffix in ENDINGS
     if out.suffix[1:].isalpha() and not is_file and not out.is_dir():
         raise InputError(f"out={out}: tables are written as {', '.join(ENDINGS)}; a folder gets one of each.")
@@ -61,7 +61,7 @@ def _write(rows: list[Row], notes: list[str], title: str, out: Path, protocol: d
 
 
 def write_table_page(rows: list[Row], title: str, notes: list[str], target: Path) -> None:
-    """Write the rows as one page, sorted by a click on a column and filtered by a word, with the notes below."""
+    """Write the rows as one page, sortable by column and filterable by word, with the notes below."""
     columns, numbers = shown_columns(rows), [*DECIMALS]
     write_page(TEMPLATE, target, title=title, columns=columns, numbers=numbers, rows=rows, notes=notes)
 

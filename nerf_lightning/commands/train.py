@@ -16,30 +16,30 @@ from nerf_lightning.training.launch.processes import on_all_processes
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training came to."""
+    """The result of training."""
 
     folder: Path
     psnr: float | None
-    """dB; of the test views, or the validation's where no evaluation follows."""
+    """Of the test views, in dB; of validation if no evaluation follows."""
 
 
 def run(config: DictConfig) -> float | None:
-    """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
+    """Train and return the test PSNR (that of validation if no evaluation follows), which sweepers may maximize."""
     with preemptible():
         return on_all_processes("train", config, lambda config: train(config).psnr)
 
 
 def train(config: DictConfig, scene: Scene | None = None) -> Trained:
-    """Train as the config says, in this process or as one of several: read, build, fit, measure, show.
+    """Train as configured, in this process or as one of several: read, build, fit, measure, show.
 
     Args:
         config: of the run.
-        scene: one in the place of the config's.
+        scene: replaces the config's.
 
     Raises:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
-    # Whatever is wrong with the input shows here, before a folder is taken.
+    # Bad input is reported here, before a folder is taken.
     job = build_job(config, scene)
     with held_folder(job, config) as folder:
         trainer = fit(job, folder)

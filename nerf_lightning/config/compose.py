@@ -1,4 +1,4 @@
-"""The config of a command, composed without a command line, as for a notebook."""
+"""Compose a command's config without a command line, such as for a notebook."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, 
     """Return the config that `nerf COMMAND OVERRIDES` would have, and the names picked from each group.
 
     Raises:
-        InputError: an override that cannot be read, or names what is not there.
+        InputError: an override cannot be read, or names something that does not exist.
     """
     config = _composed(command, overrides)
     choices = chosen(config.hydra.runtime.choices)
@@ -32,7 +32,7 @@ def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, 
 
 @contextmanager
 def composed_job(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
-    """Let a command's work be done here: its config, and Hydra's own where the command looks for it."""
+    """Provide a command's config, and Hydra's own where the command looks for it, so that it can run here."""
     config = _composed(command, overrides)
     job = HydraConfig.instance()
     former = job.cfg
@@ -54,13 +54,13 @@ def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def chosen(choices: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names picked from each group, without those of which none was."""
+    """Return the names picked from each group, without groups from which none was picked."""
     return {key: value for key, value in choices.items() if isinstance(value, str)}
 
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Let Hydra compose from our conf/, and leave another application of it, which may have called us, as it was."""
+    """Let Hydra compose from our conf/, and restore another Hydra application, which may have called us."""
     former = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     search_extensions()

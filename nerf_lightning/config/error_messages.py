@@ -22,7 +22,7 @@ from nerf_lightning.messages.escaping import listed
 
 ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
-"""How Hydra's complaints about its own options begin: plain ValueErrors."""
+"""Prefixes of Hydra's complaints about its own options, which are plain ValueErrors."""
 KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")
 ADDED = re.compile(r"(?:use 'override|remove \+ prefix:) '?(\S+?)(?:: |=)(.*?)'")
 DELETED = re.compile(r"Could not delete(?: from config\.)? '(?P<key>[^']+)'(?P<value>)")
@@ -31,7 +31,7 @@ OPTION = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 
 @contextmanager
 def in_words(command: str) -> Iterator[None]:
-    """Let whatever bad input causes leave as an InputError with one paragraph, whose hints name the command."""
+    """Turn every error caused by bad input into an InputError with one paragraph, whose hints name the command."""
     try:
         yield
     except Exception as error:
@@ -42,14 +42,14 @@ def in_words(command: str) -> Iterator[None]:
 
 
 def paragraph(error: BaseException, command: str) -> str | None:
-    """Return what a person is told of an error that bad input causes, or None for any other."""
+    """Return the message for an error caused by bad input, or None for any other error."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _missing_plugin(str(error)) or explain(error, command)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
-    # Hydra looks at what groups are given without asking first whether it is text.
+    # Hydra does not check first whether a group's value is text.
     while_choosing = any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
     if isinstance(error, (ValueError, TypeError)) and while_choosing:
         return (
@@ -58,7 +58,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
     if isinstance(error, (MemoryError, RuntimeError)):
         return _of_machine(error)
     if isinstance(error, OSError):
-        # What is closed because of bad input may fail for the same cause, and be raised in the place of it.
+        # Closing something because of bad input may fail for the same cause, and replace the original error.
         cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
         if cause is not None:
             return str(cause)
@@ -70,7 +70,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
 def _of_machine(error: MemoryError | RuntimeError) -> str | None:
     reason = " ".join(str(error).split())
     if not isinstance(error, MemoryError):
-        # Imported late: it brings torch, which a config is composed without, and which a small memory cannot hold.
+        # Imported late: it imports torch, which composing a config does not need and which may not fit into memory.
         from nerf_lightning.nerf.models.tiles import is_device_failure, is_out_of_memory
     if isinstance(error, MemoryError) or is_out_of_memory(error):
         return (
@@ -87,7 +87,7 @@ def _of_machine(error: MemoryError | RuntimeError) -> str | None:
 
 
 def _missing_plugin(message: str) -> str | None:
-    # Packages that are installed have told Hydra their names.
+    # Installed packages have registered their names with Hydra.
     unknown = re.search(r"'hydra/(launcher|sweeper)/(joblib|submitit|optuna)(_local|_slurm)?'", message)
     if unknown is None:
         return None
@@ -147,14 +147,14 @@ def _not_given(error: MissingMandatoryValue, command: str) -> str:
 
 def _chain(error: BaseException | None) -> list[BaseException]:
     links: list[BaseException] = []
-    while error is not None and error not in links:  # one that is raised again may follow from itself
+    while error is not None and error not in links:  # an error that is raised again may be its own cause
         links.append(error)
         error = error.__cause__ or error.__context__
     return links
 
 
 def unknown_name(message: str, command: str) -> str | None:
-    """Return what to say instead of Hydra's message, in one line, to a command; None where it is of something else."""
+    """Return one line to replace Hydra's message to a command; None if it is about something else."""
     asked = command_named(command)
     if asked is None:
         return None
@@ -169,7 +169,7 @@ def unknown_name(message: str, command: str) -> str | None:
 
 def _no_option(group: str, name: str) -> str | None:
     options = option_names(group)
-    if not options:  # not ours: of a folder that hydra.searchpath names, or of a plugin
+    if not options:  # not ours: from a folder in hydra.searchpath, or from a plugin
         return None
     cure = did_you_mean(name, options, f"{group}=") or f" Its options are {', '.join(options)}."
     return f"There is no {group}={name}.{cure} nerf help {group} lists them."

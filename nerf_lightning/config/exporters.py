@@ -1,4 +1,4 @@
-"""What the exporters of our conf/what/ folders say of themselves before one is built: needs, and kernels to compile.
+"""Query the exporters of our conf/what/ folders before one is built: their needs, and kernels to compile.
 
 As a program (`python -m nerf_lightning.config.exporters`): compile all CPU kernels ahead of their first use.
 """
@@ -24,7 +24,7 @@ NO_EXPORTERS = ("evaluate", "video", "report")
 
 
 def exporter_class(name: str) -> Any:
-    """Return the class that `what=NAME` builds; None where no conf/ of ours has it, as of a person's own."""
+    """Return the class that `what=NAME` builds; None if it is not in our conf/, such as the user's own."""
     file = conf_file(f"what/{name}")
     return get_class(yaml.safe_load(file.read_text(encoding="utf-8"))["_target_"]) if file.is_file() else None
 

@@ -1,4 +1,4 @@
-"""Hydra 1.3 and 1.4 used in one way, and a mend of 1.3 for Python 3.14; much of it may go once 1.4 is the least."""
+"""One interface to Hydra 1.3 and 1.4, and a fix of 1.3 for Python 3.14; much can be removed once 1.4 is required."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 IS_1_3 = hydra.__version__.startswith("1.3.")
 DEFAULTS = {"version_base": "1.3"} if IS_1_3 else {}
-"""Of `hydra.main` and `initialize_config_dir`: how older versions of Hydra behaved is not asked for."""
+"""Arguments of `hydra.main` and `initialize_config_dir`: no backward compatibility with older versions of Hydra."""
 SWEEPS_REMOVE = not hydra.__version__.startswith("1.4.0rc")
 """Whether a sweep can remove settings; release candidates of 1.4 pass `~key` to its jobs as `~key=null`."""
 
@@ -23,8 +23,8 @@ def instantiate(node: Any, trusted: Sequence[str] | None = None) -> Any:
 
     Args:
         node: the config, or a part of it.
-        trusted: all that may be built of a config from a file: names of classes, or of all below a module (`module.*`).
-            Hydra 1.3 does not look at it, so callers check, too. None: the user's own config may name anything.
+        trusted: what may be built of a config from a file: names of classes, or of everything below a module
+            (`module.*`). Hydra 1.3 ignores it, so callers check, too. None: the user's own config may name anything.
     """
     if IS_1_3:
         return utils.instantiate(node, _convert_="all")
@@ -32,7 +32,7 @@ def instantiate(node: Any, trusted: Sequence[str] | None = None) -> Any:
     try:
         return utils.instantiate(node, _convert_="all", _execution_whitelist_=allowed)
     except Exception as error:
-        # 1.4 lets errors of a constructor through, with a note of where it is named; 1.3 makes them errors of Hydra's.
+        # 1.4 passes a constructor's errors on, with a note of where it is named; 1.3 turns them into Hydra errors.
         where = next((note for note in getattr(error, "__notes__", ()) if note.startswith("full_key: ")), None)
         if where is None or isinstance(error, HydraException):
             raise
@@ -40,7 +40,7 @@ def instantiate(node: Any, trusted: Sequence[str] | None = None) -> Any:
 
 
 def hydra_main(**arguments: Any) -> Any:
-    """Return Hydra's decorator of a command, whose config is the user's own: its callbacks may be of any class."""
+    """Return Hydra's decorator for a command, whose config is the user's own: its callbacks may be of any class."""
     own = {} if IS_1_3 else {"execution_whitelist": _anything()}
     return hydra.main(**arguments, **DEFAULTS, **own)
 
@@ -50,7 +50,7 @@ def _anything() -> Any:
 
 
 def register_resolver(name: str, resolver: Callable[..., Any]) -> None:
-    """Let configs call a function, `${name:...}`."""
+    """Let configs call a function with `${name:...}`."""
     register: Any = OmegaConf.register_new_resolver if IS_1_3 else OmegaConf.register_resolver
     register(name, resolver, replace=True)
 
@@ -63,9 +63,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def options_parser() -> argparse.ArgumentParser:
-    """Return the parser of Hydra's own options, and let Hydra make others.
+    """Return the parser of Hydra's own options, and let Hydra create others.
 
-    Python 3.14's parsers look at each help text at once, and Hydra 1.3 has one that is no string. 1.4 has none.
+    Python 3.14's parsers check each help text at once, and Hydra 1.3 has one that is not a string. 1.4 has none.
     """
     if IS_1_3:
         internals.argparse = SimpleNamespace(**vars(argparse) | {"ArgumentParser": _Parser})  # type: ignore[assignment]

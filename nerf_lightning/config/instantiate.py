@@ -1,4 +1,4 @@
-"""The constructor's signature is the schema: values of the wrong kind are named before anything is built."""
+"""The constructor's signature is the schema: values of the wrong type are reported before anything is built."""
 
 import inspect
 import types
@@ -18,7 +18,7 @@ PLAIN = (bool, int, float, str, type(None))
 
 
 def require_fitting_values(node: Any, path: str = "") -> None:
-    """Hold a config against the signatures of the classes that it names, nested ones included."""
+    """Check a config against the signatures of the classes that it names, including nested ones."""
     if OmegaConf.is_config(node):
         node = OmegaConf.to_container(node, resolve=True)
     if isinstance(node, list):
@@ -41,7 +41,7 @@ def required_path(key: str, value: object) -> str:
 
 
 def require_sections(config: DictConfig, command: str) -> None:
-    """Refuse a word or number in the place of a whole section of settings of the command's own yaml."""
+    """Refuse a word or number in place of a section of settings of the command's own YAML."""
     for key, section in _sections(conf_file(command)).items():
         if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
             raise InputError(
@@ -51,14 +51,14 @@ def require_sections(config: DictConfig, command: str) -> None:
 
 @cache
 def _sections(file: Path) -> dict[str, Any]:
-    """Return what a yaml of ours holds."""
+    """Return the content of one of our YAMLs."""
     sections = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
     assert isinstance(sections, dict)
     return {str(key): section for key, section in sections.items()}
 
 
 def _parameters(target: object, path: str) -> dict[str, inspect.Parameter]:
-    # Only our own: other people's annotations promise less.
+    # Only our own: annotations of others promise less.
     if not isinstance(target, str) or not target.startswith(OURS):
         return {}
     found = locate(target)
@@ -68,7 +68,7 @@ def _parameters(target: object, path: str) -> dict[str, inspect.Parameter]:
 
 
 def require_fitting(value: Any, annotation: Any, path: str) -> None:
-    """Hold a value against an annotation, where that is made of plain types and classes of ours."""
+    """Check a value against an annotation, if that consists of plain types and our own classes."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     known = [option for option in options if option in PLAIN or get_origin(option) in (Literal, list)]
     ours = [option for option in options if inspect.isclass(option) and option.__module__.startswith(OURS)]

@@ -1,4 +1,4 @@
-"""Arguments of Lightning's Trainer that settings of ours say."""
+"""Arguments of Lightning's Trainer that our own settings determine."""
 
 OWNED = {
     "accelerator": "trainer.accelerator",
@@ -33,4 +33,4 @@ OWNED = {
     "use_distributed_sampler": "trainer.devices",
     "val_check_interval": "trainer.val_every_steps",
 }
-"""What each is here."""
+"""The setting that replaces each."""

@@ -1,4 +1,4 @@
-"""A checkpoint's config to its model, built only from our own classes and those that a person trusts."""
+"""Build a model from a checkpoint's config, using only our own classes and those that the user trusts."""
 
 import math
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.samplers.base import Sampler
 
-SPARE_NUMBERS = 1 << 24  # What a model may hold beside its weights
+SPARE_NUMBERS = 1 << 24  # Maximum that a model may hold besides its weights
 
 
 def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     """Build the model that a checkpoint describes, with its weights, in evaluation mode.
 
-    The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
-    defined in our own rooms, or in modules that a person trusts (`trusted`, with all below them), and follow one of our
-    contracts are built.
+    The config in a checkpoint is untrusted: only its `model` part is read, and only classes are built that follow one
+    of our contracts and are defined in our own packages, or in modules that the user trusts (`trusted`, including their
+    submodules).
 
     Raises:
         InputError: the config names anything else, or the weights do not fit.
     """
     config = _config_of(checkpoint, "model", trusted)
-    # First without memory: sizes from a stranger must be those of the weights beside them.
+    # First without memory: untrusted sizes must match the weights that come with them.
     with torch.device("meta"):
         shapes = build_model(config, checkpoint, trusted)
     asked = sum(tensor.numel() for tensor in (*shapes.parameters(), *shapes.buffers()))
@@ -46,7 +46,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     model = build_model(config, checkpoint, trusted)
     checkpoint.load_weights(model)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
-    # Of a point, in any layer or at the end of any encoder.
+    # Per point, in any layer or at the end of any encoder.
     sides = [max(matrix.shape) for matrix in matrices_of(model)]
     encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
     widest = max([*sides, *encoded], default=0)
@@ -55,7 +55,7 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
 
 
 def load_correction(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Correction:
-    """Build the correction that a checkpoint describes, with what it learned of each photograph, as `load_model` does.
+    """Build the correction that a checkpoint describes, with what it learned per photograph, as `load_model` does.
 
     Raises:
         InputError: the config names anything else, or the weights do not fit.
@@ -80,9 +80,9 @@ def _config_of(checkpoint: Checkpoint, part: str, trusted: Sequence[str]) -> dic
 
 
 def hold_to_budgets(model: Model, where: str) -> None:
-    """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
+    """Refuse a model that evaluates more points of a ray at once than the user allows; bound its marches.
 
-    `where` it comes from is for the message.
+    `where` is its origin, for the message.
     """
     for part in model.modules():
         if isinstance(part, Sampler):
@@ -93,7 +93,7 @@ def hold_to_budgets(model: Model, where: str) -> None:
 
 
 def build_model(config: dict[str, Any], checkpoint: Checkpoint, trusted: Sequence[str]) -> Model:
-    """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`)."""
+    """Build the model part of a checkpoint's config, which has been checked (`require_trusted`)."""
     model = _built(config, "model", checkpoint, trusted)
     if not isinstance(model, Model):
         raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")

@@ -1,4 +1,4 @@
-"""A checkpoint on its way to be looked at: the device is chosen, the file read, its model built and prepared."""
+"""Open a checkpoint: choose the device, read the file, build and prepare its model."""
 
 import logging
 from collections.abc import Sequence
@@ -25,31 +25,31 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """What a command needs of a checkpoint."""
+    """What a command needs from a checkpoint."""
 
     settings: ComputeSettings
     checkpoint: Checkpoint
     model: Model
     trusted: Sequence[str] = ()
-    """Modules of the person's own, whose parts may be built."""
+    """The user's own modules, whose classes may be built."""
 
     @property
     def tile_points(self) -> int:
-        """So many points at most are asked about at once."""
+        """Maximum number of points evaluated at once."""
         return self.settings.inference_tile_points
 
 
 def open_checkpoint(config: DictConfig, float32: bool = False) -> LoadedModel:
-    """Open `ckpt` as the config's `trainer` and `trust` say; `float32`: multiply so, whatever the run was trained in.
+    """Open `ckpt` according to the config's `trainer` and `trust`; `float32`: overrides the training precision.
 
     Raises:
-        InputError: it cannot be read, or is no checkpoint of this program.
+        InputError: it cannot be read, or is not a checkpoint of this program.
     """
     return open_checkpoints(config, [config.ckpt], float32)[0]
 
 
 def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = False) -> list[LoadedModel]:
-    """Open several; the tiles are those of the first."""
+    """Open several checkpoints; the tile size is that of the first."""
     settings: ComputeSettings = build(config.trainer)
     settings.prepare_machine()
     trusted = trusted_modules(config.trust)
@@ -70,7 +70,7 @@ def trusted_modules(trust: Any) -> list[str]:
 
 
 def scene_to_look_at(opened: LoadedModel, scene: DictConfig | None) -> Scene:
-    """Show an opened model that looks at photographs those of a scene (None: of its run), and return the scene."""
+    """Give a model that renders from photographs those of a scene (None: of its run), and return the scene."""
     if scene is None:
         path = str(opened.checkpoint.path)
         scene = compose_config("eval", [f"ckpt={quoted(path)}", *scene_overrides(path)])[0].scene
@@ -80,7 +80,7 @@ def scene_to_look_at(opened: LoadedModel, scene: DictConfig | None) -> Scene:
 
 
 def as_known(scene: Scene, opened: LoadedModel) -> Scene:
-    """Return a scene as an opened model knows it: in the frame of its training, if it was trained in a frame.
+    """Return a scene in the frame that an opened model was trained in, if it was trained in one.
 
     Raises:
         InputError: the model was trained in another kind of space.
@@ -91,7 +91,7 @@ def as_known(scene: Scene, opened: LoadedModel) -> Scene:
 def read_photographs(config: DictConfig, opened: LoadedModel) -> Scene | None:
     """Return the capture that `scene` names, as the checkpoint's model knows it.
 
-    None, and a warning, where it cannot be read.
+    If it cannot be read, warn and return None.
     """
     try:
         return as_known(build(config.scene).read(), opened)

@@ -1,4 +1,4 @@
-"""Values as they are written on the command line, for Hydra and for the shell."""
+"""Values as written on the command line, for Hydra and for the shell."""
 
 import os
 import re
@@ -11,14 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.files.folders import option_names
 
-# What Hydra takes without quotes wherever it stands.
+# What Hydra accepts without quotes in any position.
 PLAIN = re.compile(r"[\w./:@%+-]+", re.ASCII)
 OPEN_SECTIONS = re.compile(rf"(trainer\.lightning|final\.({'|'.join(option_names('what'))}))[.=]")
-"""Sections that take keys which our yaml files do not list: Lightning's arguments, and exporters by name."""
+"""Sections that accept keys which our YAML files do not list: Lightning's arguments, and exporters by name."""
 
 
 def quoted(value: Any) -> str:
-    """Return a plain value, a path or a list of them as Hydra reads it back.
+    """Return a plain value, a path or a list of them in a form that Hydra reads back.
 
     >>> quoted("it's"), quoted(None), quoted([True, 2])
     ("'it\\\\'s'", 'null', '[true,2]')
@@ -30,14 +30,14 @@ def quoted(value: Any) -> str:
     if isinstance(value, os.PathLike):
         value = os.fspath(value)
     if isinstance(value, str):
-        # OmegaConf takes ${ for an interpolation, and backslashes before it for escapes; elsewhere they are plain.
+        # OmegaConf reads ${ as an interpolation, and backslashes before it as escapes; elsewhere they are literal.
         text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
         return QuotedString(text=text, quote=Quote.single).with_quotes()
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def to_type(key: str, text: str) -> str:
-    """Return an override as a person types it in a shell, with quotes where the shell or Hydra needs them.
+    """Return an override as typed in a shell, with quotes where the shell or Hydra needs them.
 
     >>> to_type("scene.root", "data/fox")
     'scene.root=data/fox'
@@ -45,14 +45,14 @@ def to_type(key: str, text: str) -> str:
     '"scene.root=\\'my fox (1)\\'"'
     """
     override = f"{key}={text if PLAIN.fullmatch(text) else quoted(text)}"
-    # Where single quotes are in it, double ones around it are easier to read than what shlex makes.
+    # If it contains single quotes, enclosing double ones are easier to read than the output of shlex.
     if "'" in override and not re.search(r'["$`\\!]', override):
         return f'"{override}"'
     return shlex.quote(override)
 
 
 def key_of(override: str) -> str:
-    """Return the key that an override sets, adds or takes away.
+    """Return the key that an override sets, adds or removes.
 
     >>> key_of("++trainer.lightning.profiler=simple"), key_of("~callbacks.film")
     ('trainer.lightning.profiler', 'callbacks.film')
@@ -61,7 +61,7 @@ def key_of(override: str) -> str:
 
 
 def open_sections(overrides: Iterable[str]) -> list[str]:
-    """Return overrides that Hydra takes for sections whose keys it does not know, without a + from the user.
+    """Return overrides that Hydra accepts for sections with unlisted keys, without a + from the user.
 
     >>> open_sections(["trainer.lightning.profiler=simple", "final.page=true", "seed=1"])
     ['++trainer.lightning.profiler=simple', '++final.page=true', 'seed=1']

@@ -1,4 +1,4 @@
-"""The scene that a checkpoint was trained on, as overrides for our own conf/."""
+"""The training scene of a checkpoint, as overrides for our own conf/."""
 
 import logging
 import os
@@ -19,16 +19,16 @@ log = logging.getLogger(__name__)
 
 
 class UnknownScene(InputError):
-    """Report a checkpoint that is sound, but does not say what it was trained on."""
+    """A checkpoint is sound, but does not say what it was trained on."""
 
 
 def scene_overrides(path: str) -> list[str]:
-    """Return `scene=NAME` and the recorded plain values that our yaml of this name knows and a file may choose.
+    """Return `scene=NAME` and the recorded plain values that our YAML of this name has and a file may choose.
 
-    A relative place that is not found from here is taken from where the run was started, if its folder still says.
+    A relative path that does not exist here is resolved from where the run was started, if its folder still says so.
 
     Raises:
-        UnknownScene: it was trained on a scene that our conf/ lacks.
+        UnknownScene: its training scene is not in our conf/.
         InputError: the checkpoint cannot be read.
     """
     checkpoint = read_checkpoint(path)
@@ -47,12 +47,12 @@ def scene_overrides(path: str) -> list[str]:
     values = _taken(leaves(recorded, "scene"), leaves(ours, "scene"), path)
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
     if ours.get("download") and not os.path.exists(str(values.get("scene.path"))):
-        values.pop("scene.path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
+        values.pop("scene.path", None)  # downloads are where our YAML says, not where an untrusted file does
     return [f"scene={name}", *(f"{key}={quoted(value)}" for key, value in values.items())]
 
 
 def _settings_of(file: Path) -> dict[str, Any]:
-    """Return the settings of one of our yamls, with those that it takes from another (`/capture@_here_`)."""
+    """Return the settings of one of our YAMLs, with those that it includes from another (`/capture@_here_`)."""
     content = yaml.safe_load(file.read_text(encoding="utf-8"))
     taken: dict[str, Any] = {}
     for name in content.pop("defaults", []):
@@ -62,7 +62,7 @@ def _settings_of(file: Path) -> dict[str, Any]:
 
 
 def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[str, Any]:
-    """Return what is taken from a file: plain values of settings that our yaml has and the table trusts to files."""
+    """Return what is accepted from a file: plain values of settings that our YAML has and that files may set."""
     taken = {key: value for key, value in recorded.items() if key in ours and _is_taken(key, value)}
     texts_and_numbers = [key for key in ours if isinstance(recorded.get(key), str | float)]
     refused = [key for key in texts_and_numbers if key not in taken and meaning_of(key).trust is Trust.PLAIN]

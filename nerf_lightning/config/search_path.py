@@ -1,4 +1,4 @@
-"""Where Hydra looks for yaml files besides conf/."""
+"""Where Hydra looks for YAML files besides conf/."""
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
@@ -17,5 +17,5 @@ class ExtensionsSearchPath(SearchPathPlugin):
 
 
 def search_extensions() -> None:
-    """Let every config that Hydra composes from now on find the yaml files of extensions."""
+    """Let every config that Hydra composes from now on find the YAML files of extensions."""
     Plugins.instance().register(ExtensionsSearchPath)

@@ -1,9 +1,8 @@
-"""What settings mean, by group: one table, asked by whoever treats settings differently.
+"""Rules for settings, by group: one table for all code that treats settings differently.
 
-A group that is not in the table is trusted to nobody but the person at the command line; a new reader, field, loss or
-callback has the row of its group. `x.*` is each key that stands in the section x, and `x.**` is x and whatever lies
-below it. The most precise entry holds: a setting of a trusted group that says where to write, what to fetch or how far
-to trust needs one of its own.
+A group that is not in the table may be set only on the command line; a new reader, field, loss or callback has the row
+of its group. `x.*` is each key in the section x, and `x.**` is x and everything below it. The most specific entry
+applies: a setting of a trusted group that says where to write, what to fetch or how far to trust needs its own.
 """
 
 import hashlib
@@ -20,18 +19,18 @@ LEADS_OUT = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.([/\\]|\Z)")
 
 
 class Trust(Enum):
-    """What is taken of a setting from a file that may come from anybody: finite numbers, switches, null, some texts."""
+    """Which values of a setting are accepted from an untrusted file: finite numbers, switches, null, some texts."""
 
-    PLAIN = auto()  # texts that look nothing up, and paths that stay below the folder from where they are meant
-    WORDS = auto()  # single words: a path or an address is none
+    PLAIN = auto()  # texts that look nothing up, and paths that stay below the folder that they are relative to
+    WORDS = auto()  # single words, not paths or addresses
     NUMBERS = auto()  # no texts
-    PLACE = auto()  # paths of the capture, wherever it lies
-    IF_THERE = auto()  # as PLACE, but only of what exists: some scenes put there what they fetch
-    ONE_START = auto()  # nothing: it belonged to one start of a run, and the next one has its own
-    NOTHING = auto()  # nothing: a file that holds it is refused, or it is passed over where that is no danger
+    PLACE = auto()  # paths of the capture, wherever it is
+    IF_THERE = auto()  # as PLACE, but only existing paths: some scenes download to them
+    ONE_START = auto()  # nothing: it belongs to one start of a run, and the next one has its own
+    NOTHING = auto()  # nothing: a file with it is refused, or it is ignored where that is safe
 
     def takes(self, value: Any) -> bool:
-        """Return whether a value is taken; a list or a section as a whole is not."""
+        """Return whether a value is accepted; a list or a section as a whole is not."""
         if self in (Trust.ONE_START, Trust.NOTHING):
             return False
         if not isinstance(value, str):
@@ -45,39 +44,39 @@ class Trust(Enum):
 
 @dataclass(frozen=True)
 class Meaning:
-    """What is asked about a setting; as built without arguments, what is held of one that nobody has decided about."""
+    """The rules for a setting; the defaults apply to settings without an entry."""
 
     identity: bool = True
-    """A run of another value is another run: neither goes on with the other's checkpoints."""
+    """Runs with different values are different runs: neither resumes from the other's checkpoints."""
     outcome: bool = True
-    """What a run leaves depends on it: one that finished with another value has something left to do."""
+    """A run's outputs depend on it: one that finished with another value has something left to do."""
     learnt: bool = True
-    """What is learned depends on it: results of other values are not repetitions of one measurement."""
+    """What is learned depends on it: results with different values are not repetitions of one measurement."""
     shown: bool = True
     """It has a column in a table of runs that differ in it."""
     trust: Trust = Trust.NOTHING
-    """What is taken of it from a run folder, the record of a sweep, or a checkpoint."""
+    """What is accepted from a run folder, the record of a sweep, or a checkpoint."""
 
 
 UNKNOWN = Meaning()
 
-# A part of the mathematics. Nothing that nerf/ builds opens a file, and its constructors refuse what they do not know.
+# A part of the mathematics. Nothing that nerf/ builds opens a file, and its constructors refuse unknown values.
 PART = Meaning(trust=Trust.WORDS)
-# Data: what a reader is told, such as the folders in a capture.
+# Data: a reader's settings, such as the folders in a capture.
 LEARNT = Meaning(trust=Trust.PLAIN)
-# It tells whose results they are, and stands in a table's own column.
+# It identifies the results, and has its own column in a table.
 OWN_COLUMN = Meaning(learnt=False, shown=False, trust=Trust.PLAIN)
-# The machine, and how it computes; the checkpoint that a run began from.
+# The machine, and how it computes; a run's initial checkpoint.
 MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
-# How long a run lasts: a longer one goes on with a shorter one's checkpoints.
+# The length of a run: a longer one resumes from a shorter one's checkpoints.
 LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
-# What looks on while it trains.
+# What observes the training.
 WATCHING = Meaning(identity=False, learnt=False, trust=Trust.WORDS)
-# What follows the training, or changes nothing of it.
+# What follows the training, or does not affect it.
 AFTERWARDS = replace(WATCHING, shown=False, trust=Trust.PLAIN)
-# Where to write, and how to serve and to limit this start; the viewer opens a server for whoever sits there now.
+# Where to write, and how to serve and limit this start; the viewer opens a server for the current user.
 ONE_START = Meaning(identity=False, outcome=False, learnt=False, shown=False, trust=Trust.ONE_START)
-# Where to write, what to fetch, and how far to trust: the user's alone.
+# Where to write, what to fetch, and how far to trust: only the user decides.
 OF_THE_USER = replace(ONE_START, trust=Trust.NOTHING)
 
 ROWS: tuple[tuple[Meaning, str], ...] = (
@@ -89,9 +88,9 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (LEARNT, "scene.** trainer.clip_norm"),
     (OWN_COLUMN, "seed model scene scene.name"),
     (replace(OWN_COLUMN, trust=Trust.PLACE), "scene.root scene.video"),
-    (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
+    (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched if it does not exist
     (MACHINE, "trainer.** init_from"),
-    (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched otherwise
+    (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched differently
     (LENGTH, "budget.** trainer.published_steps trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
     (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
     (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),
@@ -100,7 +99,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside"),
     (UNKNOWN, "scene.download.**"),
-    # How a sweep is cut into jobs and how many there are; what they run is no number or word.
+    # How a sweep is split into jobs and how many there are; what they run is not a number or a word.
     (replace(OF_THE_USER, trust=Trust.NUMBERS), "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
     (
         replace(OF_THE_USER, trust=Trust.WORDS),
@@ -112,18 +111,18 @@ CHOSEN_GROUPS = (
     *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment", "field", "loss", "model"),
     *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
-"""Groups of conf/ of which a file may choose an option by its name. No loggers: they send pictures to accounts."""
+"""Groups of conf/ from which a file may choose an option by name. No loggers: they send pictures to accounts."""
 SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
-"""And those of which the record of a sweep may."""
+"""Groups from which the record of a sweep may."""
 
 PLACES = ("scene.root", "scene.path", "scene.video")
-"""Where a capture lies; a relative one is meant from where the run was started."""
+"""Paths of a capture; relative ones are resolved from where the run was started."""
 
 TABLE = {key: meaning for meaning, keys in ROWS for key in keys.split()}
 
 
 def meaning_of(key: str) -> Meaning:
-    """Return what a setting or a section means, by its dotted key in a config.
+    """Return the rules for a setting or a section, by its dotted key in a config.
 
     >>> meaning_of("optimizer.lr").identity, meaning_of("trainer.max_steps").identity
     (True, False)
@@ -136,7 +135,7 @@ def meaning_of(key: str) -> Meaning:
 
 
 def row_of(key: str) -> str | None:
-    """Return the entry of the table that decides about a key, None where none does."""
+    """Return the entry of the table that applies to a key; None if there is none."""
     words = key.split(".")
     sections = (".".join([*words[:count], "**"]) for count in range(len(words), 0, -1))
     return next((name for name in (key, ".".join([*words[:-1], "*"]), *sections) if name in TABLE), None)

@@ -17,7 +17,7 @@ from nerf_lightning.nerf.types.progress import Progress, batch_sizes
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
-# Of a batch, at least: where its pixels lie, its rays, and what they should look like.
+# Of a batch, at least: the places of its pixels, its rays, and their colors.
 RAY_BYTES = 120
 
 log = logging.getLogger(__name__)
@@ -27,8 +27,8 @@ class RayDataModule(LightningDataModule):
     """Ray batches for training, and a fixed subset of rays for validation.
 
     Args:
-        scene: what a reader returned.
-        progress: the run's place, shared with the system.
+        scene: as returned by a reader.
+        progress: the run's progress, shared with the system.
         seed: the run's seed.
         batch_rays: rays per training step (the batch size); with a budget, the maximum.
         sample_budget: the target number of visible samples per step, to which the number of rays adapts in a few fixed
@@ -42,10 +42,10 @@ class RayDataModule(LightningDataModule):
             0 keeps them on the host, auto is half of the free memory.
         prefetch: make the next batch in a background thread while a step runs; auto: if several cores or a GPU can do
             both at once, or if a mapped file exceeds the memory. The batches are the same.
-        patch: side in pixels of the squares that training rays come in, as the loss wants them.
+        patch: side in pixels of the square patches of training rays, as the loss requires.
         overfit_views: train on this number of photographs, spread over all, without jitter, and validate on them, to
             check that a model can overfit; None: train on all.
-        depth_every: one of so many rays runs through a pixel whose distance is known, as the loss wants it; 0: none.
+        depth_every: one in `depth_every` rays passes through a pixel of known distance, as the loss requires; 0: none.
         views_per_step: take the rays of a step from this number of photographs, equally many of each, for models that
             render each photograph from others; None: from all.
     """
@@ -103,11 +103,11 @@ class RayDataModule(LightningDataModule):
         self.device_budget, self.prefetch = device_budget, prefetch
 
     def setup(self, stage: str) -> None:
-        """Bring the pixels to where this process trains."""
+        """Move the pixels to where this process trains."""
         self.settle(self.trainer.strategy.root_device)  # type: ignore[union-attr]
 
     def settle(self, device: torch.device) -> None:
-        """Move the pixels to the device if they fit the budget; else see whether batches are made ahead for it."""
+        """Move the pixels to the device if they fit the budget; else decide whether batches are made ahead for it."""
         if self.batches.scene is not self.scene:  # they have moved already
             return
         if self.fits(device):
@@ -118,18 +118,18 @@ class RayDataModule(LightningDataModule):
         self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
 
     def fits(self, device: torch.device) -> bool:
-        """Return whether the pixels are to move to a device."""
+        """Return whether to move the pixels to a device."""
         return device.type != "cpu" and num_bytes(self.scene.pixels) <= budget_bytes(self.device_budget, device)
 
     def train_dataloader(self) -> RayBatches:
-        """Return the training batches; an epoch of them shows every ray once, or lasts as long as steps are counted."""
+        """Return the training batches; an epoch shows every ray once, or, if steps are counted, lasts for all steps."""
         trainer = self.trainer
         counts_steps = trainer is not None and trainer.max_epochs == -1 and trainer.max_steps != -1
         self.batches.num_steps = trainer.max_steps if counts_steps else self.batches.epoch_steps  # type: ignore[union-attr]
         return self.batches
 
     def val_dataloader(self) -> FixedRays | list[Batch]:
-        """Return the fixed validation rays; none of a scene without validation views, which Lightning passes over."""
+        """Return the fixed validation rays; an empty list, which Lightning skips, without validation views."""
         if not self.scene.splits.get("val"):
             return []
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
@@ -144,7 +144,7 @@ class RayDataModule(LightningDataModule):
 
 
 def _few_views(scene: Scene, count: int) -> Scene:
-    """Return the scene with a few training views, which are validated on as well; the test views stay."""
+    """Return the scene with a few training views, which also serve for validation; the test views stay."""
     if count < 1:
         raise InputError(f"data.overfit_views={count}: give at least one photograph, or null to train on all.")
     few = tuple(evenly_spaced_subset(scene.splits["train"], count))

@@ -1,4 +1,4 @@
-"""Rays of a batch through pixels whose distance is known, from sparse points or a depth sensor."""
+"""Rays of a batch through pixels of known distance, from sparse points or a depth sensor."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class DepthRays:
-    """The pixels of training views whose distance is known, numbered from 0, or squares of pixels around them.
+    """The pixels of known distance in training views, numbered from 0, or square patches around them.
 
     Args:
         scene: with depths.
@@ -29,7 +29,7 @@ class DepthRays:
         return len(self.depths)
 
     def locate(self, number: Int[Tensor, "squares"]) -> PixelIndex:
-        """Return the pixels of the squares, row by row; the known one in the middle, where the view allows."""
+        """Return the pixels of the squares, row by row, with the known one in the middle if the view allows."""
         pixels = self.depths.pixels[number]
         if self.patch == 1:
             return pixels
@@ -46,7 +46,7 @@ class DepthRays:
         )
 
     def told(self, batch: Batch, number: Int[Tensor, "squares"]) -> Batch:
-        """Return a batch with the distances of its last squares, of `locate`; its other rays have no certainty."""
+        """Return a batch with the distances of its last squares, from `locate`; its other rays have no certainty."""
         known, size = self.depths[number], self.patch**2
         distance, certainty = torch.ones_like(batch.weight), torch.zeros_like(batch.weight)
         last = batch.num_rays - len(number) * size

@@ -1,7 +1,7 @@
 """Training batches: a stateless, keyed order over every pixel, and one vectorized gather per batch.
 
-The order of rays is a permutation of all training pixels, new in each epoch and computed for a batch at a time; nothing
-is stored but how many rays have been seen, so a resumed run goes on exactly where it stopped.
+The order of rays is a permutation of all training pixels, new in each epoch and computed one batch at a time; only the
+number of rays seen is stored, so a resumed run continues exactly where it stopped.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,14 +29,14 @@ from nerf_lightning.nerf.types.tensor_struct import concatenate
 class PixelDomain:
     """The pixels of some views, or of their centers, numbered from 0; row by row, view by view.
 
-    Where pixels are to come in squares, the squares are numbered instead. They lie on a grid that may be shifted
-    against the picture; at its borders they are moved inside, so that together they hold every pixel wherever the grid
-    lies. Those near the borders may overlap.
+    If pixels come in squares, the squares are numbered instead. They form a grid that may be shifted against the
+    picture; at its borders they are moved inside, so that together they cover every pixel for any shift. Squares near
+    the borders may overlap.
 
     Args:
-        scene: the views' sizes, and where they lie.
-        views: which views take part, in order.
-        fraction: share of each side, around the center, that takes part; 1 for the whole picture.
+        scene: the views' sizes and offsets.
+        views: the views to include, in order.
+        fraction: share of each side, around the center, to include; 1 for the whole picture.
         patch: side of the squares in pixels, no longer than any picture's.
     """
 
@@ -48,7 +48,7 @@ class PixelDomain:
         self.height = (height * fraction).round().long().clamp(min=patch)
         self.left = (width - self.width) // 2
         self.top = (height - self.height) // 2
-        # One more than fit, for what a shift uncovers on the other side.
+        # One more than fits, for what a shift uncovers on the other side.
         self.columns, self.rows = ((size + 2 * (patch - 1)) // patch for size in (self.width, self.height))
         self.sizes = self.columns * self.rows
         self.ends = self.sizes.cumsum(0)
@@ -59,14 +59,14 @@ class PixelDomain:
 
     @property
     def num_rays(self) -> int:
-        """How many rays show every square once."""
+        """Number of rays that show every square once."""
         return self.count * self.patch**2
 
     def locate(self, number: Int[Tensor, "*rays"], shift: Int[Tensor, "*#rays"] | int = 0) -> PixelIndex:
-        """Return which pixel of which view each number stands for.
+        """Return the pixel and view of each number.
 
         Args:
-            number: of pixels, or of squares, for each of which all pixels are returned, in one row.
+            number: of pixels, or of squares, each of which returns all its pixels in one row.
             shift: of the grid of squares, in pixels, below `patch`.
         """
         slot = torch.searchsorted(self.ends, number, right=True)
@@ -101,19 +101,19 @@ def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
 
 
 class RayBatches:
-    """The training loader: an iterable of `Batch` that reads its place from the run's progress.
+    """The training loader: an iterable of `Batch` that reads its position from the run's progress.
 
-    Where a run has several processes, each gets its share of the one batch.
+    If a run has several processes, each gets its share of the one batch.
 
     Args:
         scene: where the pixels come from.
         progress: shared with the system, which advances it after each step.
         seed: the run's seed.
         batch_rays: rays per step.
-        patch: side in pixels of the squares that rays come in; a batch is made of whole ones.
-        views: of how many photographs the rays of a batch are; None: of all.
-        depth_every: one of so many rays (or squares) runs through a pixel whose distance is known, where any is; these
-            come last in a batch. 0: none.
+        patch: side in pixels of the squares that rays come in; a batch consists of whole squares.
+        views: number of photographs that the rays of a batch are from; None: all.
+        depth_every: one in `depth_every` rays (or squares) passes through a pixel of known distance, if there are any;
+            these come last in a batch. 0: none.
     """
 
     def __init__(
@@ -130,13 +130,13 @@ class RayBatches:
         self.depth_every = depth_every
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
-        # The device that a background thread makes batches for; None: there is no such thread.
+        # The device for which a background thread makes batches; None: no such thread.
         self.prefetch_for: torch.device | None = None
         self.take_from(scene)
         self.num_steps = self.epoch_steps
 
     def take_from(self, scene: Scene) -> None:
-        """Make batches from this copy of the scene, where its pixels lie: in memory, a mapped file, or on a device."""
+        """Make batches from this copy of the scene, whose pixels are in memory, in a mapped file, or on a device."""
         self.scene = scene
         self.whole = PixelDomain(scene, scene.splits["train"], patch=self.patch)
         self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction, self.patch)
@@ -144,29 +144,30 @@ class RayBatches:
         self.depths = depths if depths is not None and len(depths) else None
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
-        """See only the pictures' centers at first; without this, runs on white backgrounds may never start learning.
+        """Show only the pictures' centers at first; without this, runs on white backgrounds may never start learning.
 
-        The crop is a domain of its own and counts no epoch.
+        The crop is a separate domain and counts no epochs.
 
         Args:
             fraction: share of each side that the crop keeps.
             steps: its length in the first attempt.
-            restart_steps: its least length in later attempts.
+            restart_steps: its minimum length in later attempts.
         """
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = fraction, steps, max(steps, restart_steps)
         self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction, self.patch)
 
     def crop_rays(self, restarts: int) -> int:
-        """Return how many rays a run takes from the crop after so many restarts."""
+        """Return how many rays a run takes from the crop after `restarts` restarts."""
         return self.batch_rays * (self.restart_crop_steps if restarts else self.crop_steps)
 
     @property
     def epoch_steps(self) -> int:
-        """Steps that show as many rays as there are."""
+        """Number of steps that show as many rays as there are."""
         return -(-self.whole.num_rays // self.batch_rays)
 
     def __len__(self) -> int:
-        # The batches have no end, but to a trainer an epoch has one: without it a batch would be fetched ahead.
+        # The batches are endless, but a trainer needs the length of an epoch: without it a batch would be fetched
+        # ahead.
         return self.num_steps
 
     def __iter__(self) -> Iterator[Batch]:
@@ -184,7 +185,7 @@ class RayBatches:
 
     @torch_on_one_thread()
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
-        """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
+        """Return the batch after `rays_seen` rays of an attempt; `batch_rays` of None: the current batch size."""
         if self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device):
             return self._in_one_kernel(attempt, rays_seen, batch_rays)
         pixels = self.pixels_at(attempt, rays_seen, batch_rays)
@@ -204,7 +205,7 @@ class RayBatches:
         return ordered_batch(rays, numbered, self.scene.pixels, self.depths.depths, of_known)
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
-        """Return which pixels this process has of that batch."""
+        """Return this process's pixels of that batch."""
         domain, purpose, together, places = self._places_at(attempt, rays_seen, batch_rays)
         if self.views is not None:
             key = fold(self.seed, attempt, purpose)
@@ -213,7 +214,7 @@ class RayBatches:
             numbers = rays_of_few_views(starts, sizes, together.start // count, mine, count, self.views, key)
             return domain.locate(sent(numbers, domain.ends.device))
         shift: Tensor | int = 0
-        if self.patch > 1:  # each epoch has its own grid of squares, so that no pixel always lies at a border
+        if self.patch > 1:  # each epoch has its own grid of squares, so that no pixel is always at a border
             shift = sent(self._epoch_keys(places, len(domain), attempt, purpose) % self.patch, domain.ends.device)
         pixels = domain.locate(self._in_order(places, len(domain), attempt, purpose), shift)
         if self.depths is None:
@@ -221,7 +222,7 @@ class RayBatches:
         return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
 
     def _places_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> tuple[PixelDomain, str, range, range]:
-        """Return the domain of that batch, its name, and places in its order: all of the batch's, this process's."""
+        """Return the domain of that batch, its name, and positions in its order: the whole batch's, this process's."""
         position, count, slots = self._squares_at(rays_seen, batch_rays)
         before = self._num_depths(position)
         num_depths = self._num_depths(position + count) - before
@@ -235,34 +236,34 @@ class RayBatches:
         return domain, purpose, together, together[slots.start : slots.stop]
 
     def _depths_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Int[Tensor, "squares"]:
-        """Return which pixels of known distance this process has of that batch."""
+        """Return this process's pixels of known distance in that batch."""
         assert self.depths is not None
         return self._in_order(self._depth_places_at(rays_seen, batch_rays), len(self.depths), attempt, "depths")
 
     def _depth_places_at(self, rays_seen: int, batch_rays: int | None) -> range:
-        """Return where they stand in the order of all pixels of known distance."""
+        """Return their positions in the order of all pixels of known distance."""
         position, count, slots = self._squares_at(rays_seen, batch_rays)
         before = self._num_depths(position)
         first = count - (self._num_depths(position + count) - before)
         return range(before + max(slots.start - first, 0), before + max(slots.stop - first, 0))
 
     def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, range]:
-        """Return how many squares came before, how many the batch has, and which of them are this process's."""
+        """Return the number of earlier squares, the number in the batch, and which of them are this process's."""
         count = (self.progress.batch_rays if batch_rays is None else batch_rays) // self.patch**2
         return rays_seen // self.patch**2, count, range(count)[ranks.share(count)]
 
     def _num_depths(self, squares: int) -> int:
-        """Return how many of the first squares of a run have a pixel of known distance."""
+        """Return how many of a run's first `squares` squares have a pixel of known distance."""
         return 0 if self.depths is None else squares // self.depth_every
 
     def _in_order(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "squares"]:
-        """Return what stands at each position, every number below `size` once an epoch, where the pixels are."""
+        """Return the number at each position (each below `size` once per epoch), on the device of the pixels."""
         keys = self._epoch_keys(positions, size, attempt, purpose)
         number = permute(torch.arange(positions.start, positions.stop) % size, size, keys)
         return sent(number, self.whole.ends.device)
 
     def _epoch_keys(self, positions: range, size: int, attempt: int, purpose: str) -> Int[Tensor, "*#squares"]:
-        """Return the key of each position's epoch; one, where all lie in the same."""
+        """Return the key of each position's epoch; a single one if all are in the same epoch."""
         epochs = range(positions.start // size, max(positions.stop - 1, positions.start) // size + 1)
         keys = torch.tensor([fold(self.seed, attempt, purpose, epoch) for epoch in epochs])
         if len(epochs) > 1:
@@ -273,16 +274,16 @@ class RayBatches:
 class FixedRays:
     """The validation loader: a fixed, evenly spread subset of a split's rays, the same for every run and seed.
 
-    Where a run has several processes, each gets its share.
+    If a run has several processes, each gets its share.
 
     Args:
         scene: where the pixels come from.
         split: which views.
-        num_rays: size of the subset; all of the split's rays where it has fewer.
+        num_rays: size of the subset; all rays of the split if it has fewer.
         chunk: rays per batch.
 
     Raises:
-        InputError: the mask leaves out the whole subset.
+        InputError: the mask excludes the whole subset.
     """
 
     def __init__(self, scene: Scene, split: str, num_rays: int, chunk: int):
@@ -307,9 +308,9 @@ class FixedRays:
 
 
 class WholeViews:
-    """The loader of tests and predictions: each view of a split as one batch, shaped as its picture.
+    """The loader for tests and predictions: each view of a split as one batch, shaped like its picture.
 
-    Where a run has several processes, they take turns.
+    If a run has several processes, they take turns.
 
     Args:
         scene: where the pixels come from.
@@ -328,18 +329,18 @@ class WholeViews:
 
 
 Place = tuple[int, int, int]
-"""Attempt, rays seen in it, and rays of the batch: all that a batch depends on besides the config."""
+"""Attempt, rays seen in it, and rays of the batch: all that a batch depends on, besides the config."""
 
 
 def made_ahead(make: Callable[[int, int, int], Batch], current: Callable[[], Place]) -> Iterator[Batch]:
-    """Return the batch of the current place, again and again, each made while the step before it runs.
+    """Yield the batch of the current place, again and again, each made while the previous step runs.
 
-    The thread makes what follows if the run goes on as it does. Where it goes elsewhere meanwhile (a restart, batches
-    of another size), what was made is dropped, and the batch that is asked for is made on the spot: which rays
-    follow is a function of the place alone, with or without this thread.
+    The thread makes the batch that follows if the run proceeds normally. If it does not (a restart, another batch
+    size), that batch is dropped, and the requested one is made on the spot: which rays follow is a function of the
+    place alone, with or without this thread.
 
     Args:
-        make: takes a place; called in both threads, perhaps at once.
+        make: takes a place; called in both threads, possibly at once.
         current: the run's place.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:

@@ -1,4 +1,4 @@
-"""Batches whose rays come from a few photographs, for models that look at others for each that they explain."""
+"""Batches whose rays come from a few photographs, for models that render each photograph from others."""
 
 import torch
 from jaxtyping import Int
@@ -16,17 +16,17 @@ def rays_of_few_views(
     num_views: int,
     key: int,
 ) -> Int[Tensor, "rays"]:
-    """Return the numbers of a step's rays (pixels, or squares of them): as many of each of a few views.
+    """Return the indices of a step's rays (pixels, or squares of them): equally many from each of a few views.
 
-    The views follow each other in a keyed order, new each time that all have been taken, and so do the rays of each
-    view, so that nothing is stored and a step is a function of its number alone.
+    The views follow a keyed order, new each time that all have been used, and so do the rays of each view, so that
+    nothing is stored and a step is a function of its number alone.
 
     Args:
-        starts: the number of each view's first ray.
-        counts: how many each has.
+        starts: the index of each view's first ray.
+        counts: the number of each view's rays.
         step: number of the step.
-        slots: which of the batch's rays are asked for.
-        num_rays: of the whole batch; those of a view lie side by side.
+        slots: which of the batch's rays to return.
+        num_rays: of the whole batch; those of a view are contiguous.
         num_views: of a batch.
         key: of the attempt.
     """
@@ -38,7 +38,7 @@ def rays_of_few_views(
         view = int(permute(torch.tensor([place]), total, torch.tensor([fold(key, "views", lap)])))
         here = turn == number
         count = int(counts[view])
-        # A view's rays go on where they ended when it was taken last, in an order that is new once all were seen.
+        # A view's rays continue where they ended when it was last used, in an order that is new once all were seen.
         seen = lap * per_view + slots[here] % per_view
         keys = torch.tensor([fold(key, "rays of a view", view, int(round_)) for round_ in (seen // count).unique()])
         round_of = seen // count - int((seen // count).min())

@@ -1,4 +1,4 @@
-"""Checks of the cameras by themselves, and of the set of views: how many, from where, which are held out or missing."""
+"""Checks of the cameras themselves, and of the set of views: how many, from where, which are held out or missing."""
 
 import math
 
@@ -24,15 +24,15 @@ NARROW, WIDE, WIDEST = 12.0, 100.0, 140.0
 OFF_CENTER, FAR_OFF_CENTER = 0.06, 0.2
 FEW, TOO_FEW = 15, 5
 FEW_MATCHES = 30
-STEP = 10.0  # Degrees between neighbors of a good ring of photographs.
-# Degrees between a held-out view and the nearest one that is learned from.
+STEP = 10.0  # Degrees between neighbors in a good ring of photographs.
+# Degrees between a held-out view and the nearest training view.
 FAR_HELD_OUT = 40.0
-CLEARLY_MORE = 0.05  # Of the matched details: more than chance makes.
-SOUND = 0.5  # Share of matched details that lie where the cameras say, from which on the axes are right.
+CLEARLY_MORE = 0.05  # Share of the matched details that exceeds chance.
+SOUND = 0.5  # Share of matched details that agree with the cameras, from which on the axes are right.
 
 
 def rigid(evidence: Given) -> Check:
-    """Judge whether poses are rotations (no scale, no mirror), and no two cameras are one."""
+    """Judge whether poses are rotations (no scale, no mirror), and all cameras are distinct."""
     c2w = evidence.scene.cameras.c2w
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
     if bad:
@@ -50,7 +50,7 @@ def rigid(evidence: Given) -> Check:
 
 
 def common_middle(evidence: Given) -> Check:
-    """Judge whether the cameras look at, or away from, the place where their axes meet."""
+    """Judge whether the cameras look at, or away from, the point where their axes meet."""
     c2w = evidence.scene.cameras.c2w.double()
     if evidence.scene.cameras.lens_model == "equirectangular":
         return not_judged("panoramas look everywhere", "See the check of axes.")
@@ -68,7 +68,7 @@ def common_middle(evidence: Given) -> Check:
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
         if isinstance(evidence, Evidence) and evidence.agreement >= SOUND:
             return look(f"{message}, and the photographs agree with the poses", "Nothing, if they look outward.")
-        # In a box lies what all cameras look at.
+        # A box contains what all cameras look at.
         if isinstance(evidence, Evidence) and evidence.scene.space != "bounded" and not _fits_opencv(evidence):
             return look(f"{message}, and the photographs do not tell whether that is right", cure)
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
@@ -77,13 +77,13 @@ def common_middle(evidence: Given) -> Check:
 
 
 def _fits_opencv(evidence: Evidence) -> bool:
-    """Return whether clearly more of the matched details lie where the cameras say if their axes are OpenCV's."""
+    """Return whether clearly more of the matched details agree with the cameras if their axes are OpenCV's."""
     flipped = agreeing(evidence.matches, axes(evidence.scene.cameras.c2w, FLIP_YZ))
     return int(flipped.sum()) - int(evidence.agrees.sum()) > CLEARLY_MORE * len(flipped)
 
 
 def upright(evidence: Given) -> Check:
-    """Judge whether the photographs lie on their side or stand on their head in the working frame."""
+    """Judge whether the photographs are sideways or upside down in the working frame."""
     scene = evidence.scene
     up = torch.tensor([0.0, 1.0, 0.0] if scene.space == "ndc" else [0.0, 0.0, 1.0])
     right_up, up_up = (up @ scene.cameras.c2w[:, :, column].T for column in (0, 1))
@@ -119,7 +119,7 @@ def field_of_view(evidence: Given) -> Check:
 
 
 def principal_point(evidence: Given) -> Check:
-    """Judge how far the principal point lies from the photograph's center; a halved one is named."""
+    """Judge how far the principal point is from the photograph's center; report a halved one."""
     cameras = evidence.scene.cameras
     size = torch.stack([cameras.width, cameras.height], dim=-1)
     share = cameras.center / size
@@ -129,7 +129,7 @@ def principal_point(evidence: Given) -> Check:
         return ok("centered" if off < 0.0005 else message)
     usual = share.median(dim=0).values
     factor = float((usual / 0.5).mean())
-    # Photographs that were cropped, each elsewhere, have it anywhere; numbers for another size have it so in all.
+    # Photographs cropped at different places have it anywhere; numbers for another size shift it equally in all.
     is_other_size = float((usual - 0.5).abs().max()) >= FAR_OFF_CENTER
     if is_other_size and float((usual[0] - usual[1]).abs()) < 0.03:
         message += f": it belongs to photographs of {factor:.2g} times the size, it seems"
@@ -138,7 +138,7 @@ def principal_point(evidence: Given) -> Check:
 
 
 def lens(evidence: Given) -> Check:
-    """Judge how strongly the lens bends toward the corners; one that folds is refused when the capture is read."""
+    """Judge how strongly the lens distorts toward the corners; one that folds is refused when the capture is read."""
     cameras = evidence.scene.cameras
     if cameras.lens_model == "pinhole" or not bool(cameras.lens.any()):
         return ok("no distortion")
@@ -171,7 +171,7 @@ def number_of_views(evidence: Given) -> Check:
 
 
 def splits(evidence: Evidence) -> Check:
-    """Judge whether views are held out, and not learned from as well."""
+    """Judge whether views are held out, and not trained on as well."""
     parts = {split: set(views) for split, views in evidence.scene.splits.items()}
     both = sorted(parts["train"] & (parts["val"] | parts["test"]))
     if both:
@@ -199,7 +199,7 @@ def left_out(evidence: Evidence) -> Check:
 
 
 def overlap(evidence: Evidence) -> Check:
-    """Look for views that share next to nothing with others."""
+    """Find views that share almost nothing with others."""
     matches = evidence.matches
     total = len(evidence.scene.view_names)
     counts = torch.bincount(matches.view.flatten(), minlength=total)[list(matches.views)]
@@ -213,7 +213,7 @@ def overlap(evidence: Evidence) -> Check:
 
 
 def coverage(evidence: Evidence) -> Check:
-    """Report from where around the middle photographs were taken; a hole in a ring of views is noted."""
+    """Report from where around the center photographs were taken, and any gap in a ring of views."""
     scene = evidence.scene
     if scene.space == "ndc":
         return ok("forward-facing: new views are good between the cameras, not outside them")

@@ -1,4 +1,4 @@
-"""What a check says, and what it may look at."""
+"""The outcome of a check, and its evidence."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,8 +15,8 @@ from nerf_lightning.nerf.types.scene import Scene
 
 PAIRS_AT_ONCE = 1 << 24  # a capture may have 200,000 views
 Verdict = Literal["ok", "look", "wrong", "not judged"]
-"""`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be;
-`not judged`: there is too little evidence to tell."""
+"""`look`: may be intended, have a look; `wrong`: training will not work or will be much worse than it could be;
+`not judged`: there is too little evidence."""
 
 
 @dataclass(frozen=True)
@@ -26,51 +26,51 @@ class Check:
     name: str
     verdict: Verdict
     message: str
-    """What was found, in numbers."""
+    """The findings, in numbers."""
     cure: str = ""
-    """What to do about it, or what it would need to judge; empty where all is well."""
+    """What to do about it, or what is needed to judge; empty if all is well."""
     proofs: tuple[Proof, ...] = field(default=(), compare=False, repr=False)
-    """What can be shown for it, in a picture."""
+    """Evidence that can be shown in a picture."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """What the capture says of itself, before any pixel is asked."""
+    """The capture's own data, before any pixel is read."""
 
     scene: Scene
 
     def named(self, views: Iterable[int]) -> str:
-        """Return the names of views, the first few of them."""
+        """Return the names of the first few of the views."""
         return listed((self.scene.view_names[view] for view in views), cap=5)
 
 
 @dataclass(frozen=True)
 class Evidence(Given):
-    """All that checks look at."""
+    """Everything that checks use."""
 
     looks: Looks
     """What each photograph looks like."""
     matches: Matches
-    """Places that photographs have in common, found without their poses."""
+    """Places that photographs share, found without their poses."""
     agrees: Bool[Tensor, "matches"]
-    """Which of them lie where the cameras say."""
+    """Which of them agree with the cameras."""
     corners: Mapping[int, Corners]
-    """What was found in each view that was looked at, for pairs that were not compared."""
+    """Corners of each examined view, for pairs that were not compared."""
 
     @property
     def agreement(self) -> float:
-        """Share of the matches that agree; 0 where there are none."""
+        """Share of the matches that agree; 0 if there are none."""
         return float(self.agrees.float().mean()) if len(self.agrees) else 0.0
 
 
 CheckFn = Callable[[Evidence], Check]
 ok, look, wrong = partial(Check, "", "ok"), partial(Check, "", "look"), partial(Check, "", "wrong")
 not_judged = partial(Check, "", "not judged")
-"""What checks return: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`; where the evidence is too
-thin, `not_judged(message, needs)`."""
+"""Results of checks: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`, or, with too little
+evidence, `not_judged(message, needs)`."""
 MORE_DETAILS = "It needs details that several photographs show: take larger, sharper or more of them."
 
 
 def rows_at_once(columns: int) -> int:
-    """Return how many rows of a table of pairs, with so many columns, are computed at once."""
+    """Return how many rows of a table of pairs with `columns` columns are computed at once."""
     return max(1, PAIRS_AT_ONCE // columns)

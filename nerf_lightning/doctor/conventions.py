@@ -1,4 +1,4 @@
-"""Other readings of the same numbers: what a capture's poses or photographs may have been meant as."""
+"""Other conventions that a capture's poses or photographs may follow."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ class Reading:
     """Another way to read a capture."""
 
     says: str
-    """What the capture looks like, as the rest of "the poses look ..."."""
+    """How the capture looks; completes "the poses look ..."."""
     cure: str
     change: Callable[[Scene, Matches], tuple[Float[Tensor, "views 3 4"], Matches]]
 
@@ -42,17 +42,17 @@ def axes(c2w: Float[Tensor, "views 3 4"], signs: tuple[float, float, float]) -> 
 
 
 def transposed(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return the poses with their rotations alone transposed."""
+    """Return the poses with only their rotations transposed."""
     return torch.cat([c2w[:, :, :3].mT, c2w[:, :, 3:]], dim=-1)
 
 
 def centers_for_translations(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return the poses with the translation (world to camera, right, down, forward) in the place of the center."""
+    """Return the poses with the translation (world to camera, right, down, forward) in place of the center."""
     return torch.cat([c2w[:, :, :3], -axes(c2w, FLIP_YZ)[:, :, :3].mT @ c2w[:, :, 3:]], dim=-1)
 
 
 def other_quaternions(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return the poses whose quaternions (world to camera) are x, y, z, w where w, x, y, z was read."""
+    """Return the poses if their quaternions (world to camera) are x, y, z, w instead of w, x, y, z."""
     turned = axes(c2w, FLIP_YZ)
     w2c = rotation_from_quaternion(quaternion_from_rotation(turned[:, :, :3].mT)[:, [3, 0, 1, 2]])
     translation = -turned[:, :, :3].mT @ turned[:, :, 3:]
@@ -66,7 +66,7 @@ def mirrored(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
 
 
 def numeric_order(cameras: Cameras, names: tuple[str, ...]) -> Tensor:
-    """Return where each view's row stands when rows follow the numbers in the names, not the names as text."""
+    """Return each view's row if rows are sorted by the numbers in the names, not by the names as text."""
     digits = ["".join(c for c in name.rsplit("/", 1)[-1] if c.isdigit()) for name in names]
     by_number = sorted(range(len(names)), key=lambda view: (int(digits[view] or 0), names[view]))
     by_text = sorted(range(len(names)), key=lambda view: names[view])
@@ -80,7 +80,7 @@ def _poses(change: Callable[[Tensor], Tensor]) -> Callable[[Scene, Matches], tup
 
 
 def _pictures(x: float, y: float) -> Callable[[Scene, Matches], tuple[Tensor, Matches]]:
-    # Mirrored about the principal point: good enough to tell.
+    # Mirrored about the principal point: good enough for a decision.
     return lambda scene, matches: (
         scene.user_cameras.c2w,
         replace(matches, plane=matches.plane * matches.plane.new_tensor([x, y])),
@@ -167,4 +167,4 @@ ORDERS = (
         _poses(lambda c2w: c2w.flip(0)),
     ),
 )
-"""Of which photograph has which pose."""
+"""Of the assignment of poses to photographs."""

@@ -1,4 +1,4 @@
-"""Do poses agree with matched places: each must lie on the line that the other's ray draws into its picture."""
+"""Check poses against matched places: each must lie on the epipolar line of the other's ray."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +11,7 @@ TOLERANCE = 1.5  # Pixels of the shrunk pictures
 
 
 def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:
-    """Return which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
+    """Return which matches the poses explain: rays that meet, within `TOLERANCE`, in front of both cameras.
 
     Focal lengths are multiplied by `zoom`.
     """
@@ -20,16 +20,16 @@ def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.
 
 
 def line_distances(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Float[Tensor, "matches 2"]:
-    """Return how far each place lies from the line that the other's ray draws, in pixels of the shrunk pictures.
+    """Return the distance of each place from the epipolar line of the other's ray, in pixels of the shrunk pictures.
 
-    With D, E the rays and b the way between the centers, the plane of b and E cuts the other picture in a line (the
-    epipolar line). Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9. Arguments as in `agreeing`.
+    With D, E the rays and b the vector between the centers, the plane of b and E intersects the other picture in a line
+    (the epipolar line). Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9. Arguments as in `agreeing`.
     """
     rays, between = rays_of(matches, c2w, zoom)
     off = []
     for here, there in ((0, 1), (1, 0)):
         normal = functional.normalize(torch.linalg.cross(between, rays[:, there]), dim=-1)
-        # The line in the axes of the picture: its first two numbers lie along the picture.
+        # The line in the axes of the picture: its first two components are in the picture's plane.
         right, up, back = c2w[matches.view[:, here], :, :3].double().unbind(dim=-1)
         slope = ((normal * right).sum(dim=-1).square() + (normal * up).sum(dim=-1).square()).sqrt()
         depth = -(rays[:, here] * back).sum(dim=-1)
@@ -39,22 +39,22 @@ def line_distances(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: floa
 
 
 def distances(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 2"]:
-    """Return how far along both rays each match lies, where the rays come nearest to each other (scene units).
+    """Return the distances of each match along both rays, where the rays are closest to each other (scene units).
 
-    Worth little where the rays are nearly parallel: see `parallax`.
+    Unreliable if the rays are nearly parallel: see `parallax`.
     """
     return _nearest(*rays_of(matches, c2w)).float()
 
 
 def places(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 3"]:
-    """Return where in the world each match lies, on the first ray (scene units)."""
+    """Return the world position of each match, on the first ray (scene units)."""
     rays, between = rays_of(matches, c2w)
     first = c2w[matches.view[:, 0], :, 3].double()
     return (first + _nearest(rays, between)[:, :1] * rays[:, 0]).float()
 
 
 def parallax(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches"]:
-    """Return the angle between both rays of each match, in radians."""
+    """Return the angle between the two rays of each match, in radians."""
     rays, _ = rays_of(matches, c2w)
     return torch.linalg.cross(rays[:, 0], rays[:, 1]).norm(dim=-1).clamp(max=1).asin().float()
 
@@ -62,11 +62,11 @@ def parallax(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor,
 def rays_of(
     matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0
 ) -> tuple[Float[Tensor, "matches 2 3"], Float[Tensor, "matches 3"]]:
-    """Return unit rays of both ends, and the way from the first camera to the second (scene units)."""
+    """Return unit rays of both ends, and the vector from the first camera to the second (scene units)."""
     plane = matches.plane.double() / zoom
     local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
     poses = c2w[matches.view].double()
-    # Written out: a matrix product for each of many matches is slow.
+    # Written out: a matrix product per match is slow.
     rays = functional.normalize((poses[..., :3] * local[..., None, :]).sum(dim=-1), dim=-1)
     return rays, poses[:, 1, :, 3] - poses[:, 0, :, 3]
 

@@ -1,4 +1,4 @@
-"""All checks of a capture, and what they look at. A new check is a function, named in CHECKS of its file."""
+"""All checks of a capture, and their evidence. A new check is a function, listed in CHECKS of its file."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,35 +25,35 @@ CHECKS: dict[str, CheckFn] = {
 
 
 FIRST_ADVICE = ("coverage", "photographs without pose", "number of views", "overlap")
-"""Checks whose cures are worth most: photographs that are missing cannot be made up for."""
+"""Checks whose cures are worth most: nothing compensates for missing photographs."""
 
 
 def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
-    """Return the outcome of every check, and what they looked at; takes seconds."""
+    """Return the evidence, and the outcome of every check; takes seconds."""
     if scene.capture_of is not None:
         raise InputError(
             f"{scene.name} joins {len(scene.captures)} captures, and the doctor examines one at a time: give "
             "scene=auto scene.root=DIR; or doctor=off to train all the same."
         )
-    # Pictures are spread over our own threads; torch's would only stand in their way.
+    # Pictures are distributed over our own threads; torch's would only get in their way.
     with torch_threads(1):
         evidence = gather_evidence(scene)
         return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
 
 
 def advice(checks: Sequence[Check]) -> str | None:
-    """Return the one thing that would improve a result most; None where nothing was found."""
+    """Return the one cure that would improve a result most; None if nothing was found."""
     doubtful = {check.name: check.cure for check in checks if check.verdict in ("look", "wrong") and check.cure}
     return next((doubtful[name] for name in [*FIRST_ADVICE, *doubtful] if name in doubtful), None)
 
 
-# More views than these are thinned out evenly to be compared with each other; that costs the square.
+# If there are more views, an even subset is compared with each other; the cost is quadratic.
 MOST_COMPARED = 160
 NOTICEABLE = 30
 
 
 def gather_evidence(scene: Scene) -> Evidence:
-    """Return what the checks need to know of a scene; takes seconds."""
+    """Return what the checks need to know about a scene; takes seconds."""
     total = len(scene.view_names)
     compared = {total * number // min(total, MOST_COMPARED) for number in range(min(total, MOST_COMPARED))}
     cameras = shrunk_cameras(scene.cameras)

@@ -1,4 +1,4 @@
-"""Checks of where content is looked for: near, far and the box, against cameras and content."""
+"""Checks of near, far and the box against cameras and content."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,20 +13,20 @@ from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 
-# Rays that meet at a smaller angle (radians) say little of distances.
+# Rays that meet at a smaller angle (radians) say little about distances.
 LEAST_PARALLAX = 0.04
 FEWEST = 50
 # Share of the content that may be cut off: a few matches and points are mistakes.
 FEW, MANY = 0.03, 0.15
-# Of each view, a grid of GRID x GRID pixels is looked at.
+# A grid of GRID x GRID pixels is examined in each view.
 GRID = 12
-# Of sparse points and of views, that are looked at.
+# Maximum number of sparse points, and of views, that are examined.
 MOST_POINTS, MOST_VIEWS = 5000, 200
 UNITS = {"inches": 39.37, "feet": 3.281, "centimeters": 100.0, "millimeters": 1000.0}
 
 
 def near_and_far(evidence: Evidence) -> Check:
-    """Judge whether content lies between near and far."""
+    """Judge whether content is between near and far."""
     scene = evidence.scene
     found = content_distances(evidence)
     if found is None:
@@ -50,15 +50,15 @@ def near_and_far(evidence: Evidence) -> Check:
         return ok(message)
     cut = f"{100 * before:.0f} % of it in front of near and {100 * beyond:.0f} % behind far"
     cure = f"Set scene.near={0.8 * low:.2g} scene.far={1.3 * high:.3g}.{_units(low, high, near, far)}"
-    # What nobody has typed is a guess of this program, which is never wrong to the user.
+    # Values that the user has not typed are this program's guesses, which are never reported as wrong.
     serious = max(before, beyond) > MANY and (scene.space == "bounded" or scene.protocol.keys() & {"near", "far"})
     return (wrong if serious else look)(f"{message}: {cut}", cure)
 
 
 def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "content"]] | None:
-    """Return views, and how far from them content lies that they show (scene units; in NDC: depth before bending).
+    """Return views and distances of the content that they show (scene units; in NDC: depth before warping).
 
-    From matched details, and where these are few from the known distances, or from the sparse points.
+    From matched details, or if these are few, from the known distances or the sparse points.
     """
     scene, matches = evidence.scene, evidence.matches
     good = clear_matches(evidence)
@@ -75,7 +75,7 @@ def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "conten
 
 
 def _in_pictures(scene: Scene) -> tuple[Tensor, Float[Tensor, "content"]] | None:
-    """Return views, and how far from them sparse points lie that are in their pictures; None: few are."""
+    """Return views and the distances of the sparse points in their pictures; None if there are few."""
     points = scene.points[:: 1 + len(scene.points) // MOST_POINTS]
     views, found = [], []
     for view in evenly_spaced_subset(range(len(scene.view_names)), MOST_VIEWS):
@@ -87,12 +87,12 @@ def _in_pictures(scene: Scene) -> tuple[Tensor, Float[Tensor, "content"]] | None
 
 
 def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
-    """Return which matches say where in the world they lie."""
+    """Return which matches determine their world position."""
     return evidence.agrees & (parallax(evidence.matches, evidence.scene.cameras.c2w) > LEAST_PARALLAX)
 
 
 def box_in_view(evidence: Evidence) -> Check:
-    """Judge whether every view's rays meet the box that is modeled, between near and far."""
+    """Judge whether every view's rays meet the modeled box between near and far."""
     scene = evidence.scene
     if scene.space != "bounded":
         return ok(f"space is {scene.space}: no box bounds the content")
@@ -155,7 +155,7 @@ def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
 
 
 def _units(low: float, high: float, near: float, far: float) -> str:
-    # near and far in another unit than the poses.
+    # near and far have another unit than the poses.
     if min(far, high) <= 0 or (near > 0 and low <= 0):
         return ""  # a ratio needs distances
     factor = ((near * far) / (low * high)) ** 0.5 if near > 0 else far / high

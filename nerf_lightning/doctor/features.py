@@ -1,7 +1,6 @@
-"""What photographs look like: corners, described so that neighboring photographs have them too, and a few numbers.
+"""Features of photographs: corners, with descriptors that match between neighbors, and a few numbers.
 
-The corners are upright and of one scale: made for neighbors, of which a part may well fail, and not for structure from
-motion.
+The corners are upright and of one scale: suited to neighbors, some of which may fail, and not to structure from motion.
 """
 
 from dataclasses import dataclass
@@ -14,28 +13,28 @@ from torch.nn import functional
 from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 
-LONGER_SIDE = 288  # Pixels of the longer side of the pictures that are looked at
+LONGER_SIDE = 288  # Longer side in pixels of the examined pictures
 MOST_CORNERS = 400
 BORDER = 8
 LEAST_CLEAR = 1e-6
 DIRECTIONS = 8
-# A descriptor looks at 4 x 4 places that lie so many pixels apart.
+# A descriptor samples 4 x 4 places at this spacing in pixels.
 PLACES, SPACING = 4, 4.0
 # A match must be this much better than the second best (of distances; Lowe, "Distinctive image features", 2004).
 RATIO = 0.85
 THUMBNAIL = 24
-# Fine detail is looked for at no more pixels than this along the longer side, whatever the photographs were shrunk to;
-# finer is noise on many cameras.
+# Fine detail is measured at no more than this many pixels along the longer side, however photographs were shrunk; finer
+# detail is noise on many cameras.
 SHARP_SIDE = 480
-# Deviations (pixels) of what blurs the picture for fine and for coarse detail; pixels of the outline that are left out;
-# slope (per pixel, of 1) from which on there is texture, and pixels of it that tell something.
+# Standard deviations (pixels) of the blurs for fine and for coarse detail; pixels of the outline that are ignored;
+# slope (per pixel, of 1) from which on there is texture, and the minimum number of textured pixels.
 FINE, COARSE, OUTLINE = 0.7, 2.0, 3
 LEAST_SLOPE, LEAST_TEXTURE = 0.002, 150
 
 
 @dataclass(frozen=True)
 class Corners:
-    """What was found in one picture, the clearest first."""
+    """The corners of one picture, the clearest first."""
 
     at: Float[Tensor, "corners 2"]
     """x and y in pixels of the shrunk picture; pixel centers at +0.5."""
@@ -46,14 +45,14 @@ class Corners:
 
 
 def shrunk_cameras(cameras: Cameras, longer_side: int = LONGER_SIDE) -> Cameras:
-    """Return the cameras of the pictures that corners are looked for in, which need not be smaller."""
+    """Return the cameras of the pictures in which corners are detected, which need not be smaller."""
     scale = longer_side / torch.maximum(cameras.width, cameras.height)
     width, height = ((scale * side).round().long().clamp(min=1) for side in (cameras.width, cameras.height))
     return resized(cameras, width, height)
 
 
 def small_picture(pixels: PixelStore, view: int, width: int, height: int) -> Float[Tensor, "3 height width"]:
-    """Return a view's colors (0 to 1) at another size; what is transparent or masked is middle gray."""
+    """Return a view's colors (0 to 1) at another size; transparent or masked pixels are middle gray."""
     rgba = pixels.view(view).float().permute(2, 0, 1) / 255
     cover = rgba[3]
     kept = pixels.kept(view)
@@ -69,7 +68,7 @@ def brightness(picture: Float[Tensor, "3 *places"]) -> Float[Tensor, "*places"]:
 
 
 def find_corners(picture: Float[Tensor, "3 height width"], most: int = MOST_CORNERS) -> Corners:
-    """Return the places of one picture that are clear in both directions (Shi and Tomasi, 1994)."""
+    """Return the corners of one picture, which are distinct in both directions (Shi and Tomasi, 1994)."""
     grey = brightness(picture)
     gx, gy = _gradient(_blurred(grey[None], 0.8))
     xx, yy, xy = _blurred(torch.cat([gx * gx, gy * gy, gx * gy]), 1.5)
@@ -80,7 +79,7 @@ def find_corners(picture: Float[Tensor, "3 height width"], most: int = MOST_CORN
     value, index = torch.where(peak & inside, clear, 0.0).flatten().topk(min(most, clear.numel()))
     index = index[value > LEAST_CLEAR]
     x, y = index % grey.shape[1], index // grey.shape[1]
-    # The top of a parabola through the peak and its neighbors lies between the pixels.
+    # Subpixel position: the vertex of a parabola through the peak and its neighbors.
     shift = torch.stack([_top(*(clear[y, x + k] for k in (-1, 0, 1))), _top(*(clear[y + k, x] for k in (-1, 0, 1)))])
     at = torch.stack([x, y], dim=-1) + 0.5 + shift.T
     return Corners(at, _described(gx[0], gy[0], at), _blurred(picture, 2.0)[:, y, x].T)
@@ -92,7 +91,7 @@ def _top(before: Float[Tensor, "corners"], here: Float[Tensor, "corners"], after
 
 
 def match(first: Corners, second: Corners) -> Int[Tensor, "matches 2"]:
-    """Return pairs of corners that are each other's nearest, and clearly nearer than the next."""
+    """Return pairs of mutually nearest corners that are clearly nearer than the next."""
     if min(len(first.at), len(second.at)) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
     similar = first.descriptor @ second.descriptor.T
@@ -136,7 +135,7 @@ def _blurred(pictures: Float[Tensor, "maps height width"], sigma: float) -> Floa
 
 
 def _weighted(padded: Float[Tensor, "maps rows columns"], weights: list[float], dim: int) -> Tensor:
-    # Shifted pictures added up: on a CPU 20 times as fast as a convolution of one channel.
+    # Sums of shifted pictures: on a CPU 20 times as fast as a convolution of one channel.
     size = padded.shape[dim] - len(weights) + 1
     total = padded.narrow(dim, 0, size) * weights[0]
     for place, weight in enumerate(weights[1:], 1):
@@ -149,9 +148,9 @@ class Looks:
     """One row per view of the scene."""
 
     thumbnail: Float[Tensor, "views side side"]
-    """Brightness, on middle gray where transparent or masked."""
+    """Brightness; transparent or masked pixels are middle gray."""
     fineness: Float[Tensor, "views directions"]
-    """How fine the detail is, however much of it there is: see `fineness_of`."""
+    """Fineness of the detail, whatever its amount: see `fineness_of`."""
     kept: Float[Tensor, "views"]
     """Share of the pixels that the mask keeps."""
     covered: Float[Tensor, "views"]
@@ -161,7 +160,7 @@ class Looks:
     border_even: Float[Tensor, "views"]
     """Share of the edge's pixels that have this color, to two levels."""
     faint: Float[Tensor, "views 2"]
-    """How many nearly transparent pixels are brighter than half of their alpha: up to alpha, and beyond."""
+    """Number of nearly transparent pixels brighter than half of their alpha: up to alpha, and beyond."""
 
 
 def look_at_view(pixels: PixelStore, view: int, picture: Float[Tensor, "3 height width"]) -> tuple[Tensor, ...]:
@@ -184,10 +183,10 @@ def look_at_view(pixels: PixelStore, view: int, picture: Float[Tensor, "3 height
 
 
 def fineness_of(pixels: PixelStore, view: int) -> Float[Tensor, "directions"]:
-    """Return how fine the detail of a photograph is along each of eight directions, of half a circle.
+    """Return how fine the detail of a photograph is along each of eight directions of a half circle.
 
     It is the log of the power of the second derivative over that of the slopes of a blurred picture, in the textured
-    half of what is neither transparent nor masked. A moving camera takes it along one direction only. NaN: there is too
+    half of what is neither transparent nor masked. Camera motion reduces it along one direction only. NaN: there is too
     little texture.
     """
     rgba, kept = pixels.view(view), pixels.kept(view)
@@ -198,7 +197,7 @@ def fineness_of(pixels: PixelStore, view: int) -> Float[Tensor, "directions"]:
         size = [max(1, round(share * side)) for side in rgba.shape[:2]]
         both = functional.interpolate(both[None], size, mode="bilinear", antialias=True)[0]
     grey, whole = both[:, None]
-    # The outline against what is transparent is as sharp in a blurred photograph.
+    # The outline of transparent areas is sharp even in a blurred photograph.
     rim = functional.max_pool2d(
         functional.pad((whole < 0.999).float(), (OUTLINE,) * 4, value=1.0), 2 * OUTLINE + 1, stride=1
     )

@@ -1,4 +1,4 @@
-"""Before hours are spent on a capture: what is wrong with it stops the training, what is doubtful is said."""
+"""Examine a capture before hours are spent on it: problems stop the training, doubts are logged."""
 
 import logging
 from collections.abc import Callable
@@ -18,17 +18,17 @@ QUICK: dict[str, Callable[[Given], Check]] = {
     "principal point": cameras.principal_point,
     "number of views": cameras.number_of_views,
 }
-"""Checks that cost nothing, and find what is wrong."""
+"""Checks that cost nothing and find problems."""
 NEVER_POINTLESS = ("number of views", "split")
-"""Checks that do not stop a training, whatever they find: it is worth something all the same."""
-ROWS = 8  # Of a photograph, that are looked at first: nearly all show something there
-SPREAD = 3  # Levels of 255 that a JPEG makes of one
+"""Checks that never stop a training: its result is worth something all the same."""
+ROWS = 8  # Rows of a photograph that are examined first: nearly all show something there
+SPREAD = 3  # Levels of 255 that a single one becomes in a JPEG
 
 log = logging.getLogger(__name__)
 
 
 def require_sound(scene: Scene) -> list[Check]:
-    """Examine a scene, and return what each check says; takes seconds."""
+    """Examine a scene and return the outcome of each check; takes seconds."""
     _, checks = examine(scene)
     for check in checks:
         if check.verdict == "look" or (check.verdict == "wrong" and check.name in NEVER_POINTLESS):
@@ -49,13 +49,13 @@ def require_sound(scene: Scene) -> list[Check]:
 
 
 def exposure_finding(checks: list[Check] | None) -> str | None:
-    """Return what the checks say of photographs that were exposed differently, if anything."""
+    """Return what the checks say about different exposures of photographs, if anything."""
     found = [check.message for check in checks or () if check.name == "exposure" and check.verdict == "look"]
     return found[0] if found else None
 
 
 def warn_of_faults(scene: Scene) -> None:
-    """Say what is wrong with a scene as far as that is seen in no time, whether the doctor is asked or not."""
+    """Warn about faults of a scene that are found instantly, whether the doctor is enabled or not."""
     train = scene.splits["train"]
     found = in_threads(lambda number: _nothing(scene.pixels, train[number]), len(train), "Looking", shown=False)
     blank = [f"{scene.view_names[view]} ({what})" for view, what in zip(train, found, strict=True) if what]
@@ -73,7 +73,7 @@ def warn_of_faults(scene: Scene) -> None:
 
 
 def _nothing(pixels: PixelStore, view: int) -> str | None:
-    """Return what is there in the place of a picture: one color, or nothing at all; None: a picture."""
+    """Return what replaces a picture: one color, or nothing at all; None if it is a picture."""
     rgba, kept = pixels.view(view), pixels.kept(view)
     for step in (max(1, len(rgba) // ROWS), 1):
         part = rgba[::step].reshape(-1, 4) if kept is None else rgba[::step][kept[::step]]

@@ -13,23 +13,24 @@ from nerf_lightning.nerf.rendering.background import at_evaluation
 
 # Mean difference of thumbnails, in units of their contrast.
 SAME = 0.012
-# So many views nearby are compared with; fewer say nothing.
+# Number of nearby views to compare with; fewer say nothing.
 NEIGHBORS, FEWEST_NEIGHBORS = 6, 4
-# A photograph is blurred that has less than this share of its neighbors' fine detail; within these bounds the share
-# depends on how much photographs differ anyway: so many deviations.
+# A photograph is blurred if it has less than this share of its neighbors' fine detail; within these bounds the share
+# depends on the usual variation between photographs, in deviations.
 SOFT, SOFTEST, DEVIATIONS = 0.5, 0.27, 4.5
-# Pixels that tell whether colors are multiplied by alpha, and the share of them that may be brighter all the same.
+# Number of pixels that show whether colors are premultiplied by alpha, and the share of them that may still be
+# brighter.
 FAINT, STRAY = 100, 0.005
 # Factors of brightness and of red or blue against green.
 EXPOSURE, TINT = 1.35, 1.2
-# Matches of a pair of photographs that say something of their brightness.
+# Minimum number of matches of a pair of photographs to compare their brightness.
 FEWEST = 20
 EVEN = 0.97
 COLOURS = {"white": 1.0, "black": 0.0}
 
 
 def duplicates(evidence: Evidence) -> Check:
-    """Look for photographs that are there twice."""
+    """Find duplicate photographs."""
     flat = evidence.looks.thumbnail.flatten(1)
     flat = flat - flat.mean(dim=1, keepdim=True)
     contrast = flat.std(dim=1)
@@ -50,7 +51,7 @@ def duplicates(evidence: Evidence) -> Check:
 def _pairs_alike(
     flat: Float[Tensor, "views values"], contrast: Float[Tensor, "views"], rows: Int[Tensor, "rows"]
 ) -> Int[Tensor, "pairs 2"]:
-    """Return which later view each of some views equals, relative to its own contrast."""
+    """Return pairs of a view in `rows` and a later view that equals it, relative to its own contrast."""
     apart = torch.cdist(flat[rows], flat) / THUMBNAIL / contrast[rows, None].clamp(min=1e-3)
     later = torch.arange(len(flat)) > rows[:, None]
     pairs = ((apart < SAME) & (contrast[rows, None] > 1e-3) & later).nonzero()
@@ -58,7 +59,7 @@ def _pairs_alike(
 
 
 def blur(evidence: Evidence) -> Check:
-    """Look for photographs that are much less sharp, along any direction, than those from nearby."""
+    """Find photographs that are much less sharp, along any direction, than those nearby."""
     fineness = evidence.looks.fineness
     shown = (~fineness.isnan().any(dim=1)).nonzero()[:, 0]
     if len(shown) <= FEWEST_NEIGHBORS or 2 * len(shown) < len(fineness):
@@ -125,7 +126,7 @@ def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | Non
 
 
 def transparency(evidence: Evidence) -> Check:
-    """Judge alpha, and whether colors were multiplied by it already."""
+    """Judge alpha, and whether colors are already premultiplied."""
     scene, looks = evidence.scene, evidence.looks
     if not scene.pixels.has_transparency:
         return ok("the photographs are opaque")
@@ -135,7 +136,7 @@ def transparency(evidence: Evidence) -> Check:
         message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
         return look(message, "See that alpha was exported, or remove these views.")
     up_to, beyond = looks.faint.sum(dim=0).tolist()
-    # Cutting out leaves the colors as they were.
+    # Cutting out does not change colors.
     if "cut_out" not in scene.protocol and up_to + beyond < FAINT:
         needs = f"It needs {FAINT} pixels that are nearly transparent; of hard outlines there is nothing to multiply."
         return not_judged(f"{covered}; whether colors are multiplied by alpha cannot be seen", needs)
@@ -147,7 +148,7 @@ def transparency(evidence: Evidence) -> Check:
 
 
 def baked_background(evidence: Evidence) -> Check:
-    """Look for a background of one color that opaque photographs have, or had, baked in."""
+    """Find a background of one color that opaque photographs have, or had, baked in."""
     scene, looks = evidence.scene, evidence.looks
     if color := scene.protocol.get("cut_out"):
         message = f"plain {color}, which was made transparent (scene.cut_out)"

@@ -1,4 +1,4 @@
-"""Which places of different photographs show the same thing, found from the pixels alone, and what that proves."""
+"""Match places of different photographs by their pixels alone, and collect proofs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,37 +12,37 @@ from nerf_lightning.doctor.features import Corners, match
 from nerf_lightning.nerf.geometry.lenses import unproject
 from nerf_lightning.nerf.types.scene import Cameras
 
-# So many corners of each tell which pictures show the same.
+# Number of corners of each picture used to find pictures of the same content.
 FEW_CORNERS = 64
-# Each view is compared with so many others.
+# Number of others that each view is compared with.
 PARTNERS = 6
 ALIKE = 0.8
-# Of a panorama only what lies ahead of its camera (within 60 degrees) is compared: to the sides, places in a plane run
-# off to infinity. Elsewhere they are held back only where they would.
+# Of a panorama only what is ahead of its camera (within 60 degrees) is compared: to the sides, places in a plane go to
+# infinity. For other lenses they are limited only where they would.
 AHEAD, HARDLY_AHEAD = 0.5, 0.05
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched places, of all pairs one after the other."""
+    """Matched places of all pairs, concatenated."""
 
     view: Int[Tensor, "matches 2"]
     """Which two views of the scene."""
     plane: Float[Tensor, "matches 2 2"]
-    """Place in each, in focal lengths from the principal point, x right, y down, the lens undone."""
+    """Place in each, undistorted, in focal lengths from the principal point, x right, y down."""
     focal: Float[Tensor, "matches 2"]
     """Focal length of each, in pixels of the shrunk pictures."""
     rgb: Float[Tensor, "matches 2 3"]
     """Color around the place in each."""
     views: tuple[int, ...]
-    """The views that were looked at: all, or of very many some."""
+    """The examined views: all, or a subset of very many."""
 
     def where(self, rows: Bool[Tensor, "matches"] | slice) -> "Matches":
-        """Return some of the matches."""
+        """Return the selected matches."""
         return Matches(self.view[rows], self.plane[rows], self.focal[rows], self.rgb[rows], self.views)
 
     def with_first(self, view: int) -> "Matches":
-        """Return a view's matches, its own end first in each."""
+        """Return a view's matches with its own end first."""
         own = self.where((self.view == view).any(dim=1))
         turned = own.view[:, 1] == view
         view_, plane, focal, rgb = (
@@ -54,20 +54,20 @@ class Matches:
 
 @dataclass(frozen=True)
 class Proof:
-    """Two photographs with details that a person can find in both, and that the cameras contradict."""
+    """Two photographs with details that are visible in both and that contradict the cameras."""
 
     matches: Matches
-    """Details of the two, all of which speak against the cameras."""
+    """Details of the two, all of which contradict the cameras."""
     fits: Cameras | None
-    """All cameras as the details say that they are, where that is known."""
+    """All cameras according to the details, if known."""
 
 
 def strongest_proof(
     matches: Matches, against: Bool[Tensor, "matches"], fits: Cameras | None, view: int | None = None
 ) -> tuple[Proof, ...]:
-    """Return the pair of photographs (with `view` first, if given) with most of the matches that speak `against`.
+    """Return the pair of photographs (with `view` first, if given) with most of the matches `against` the cameras.
 
-    There may be none; `fits` are the cameras that they speak for.
+    There may be none; `fits` are the cameras that they support.
     """
     matches = matches.where(against) if view is None else matches.where(against).with_first(view)
     if not len(matches.view):
@@ -79,7 +79,7 @@ def strongest_proof(
 def matched_pairs(
     cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], shown: bool = False
 ) -> Matches:
-    """Return places that are matched between the two views of each pair; cameras are of the shrunk pictures' size."""
+    """Return places matched between the two views of each pair; cameras are for the shrunk pictures."""
 
     def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         both = list(pairs[number])
@@ -99,7 +99,7 @@ def matched_pairs(
 
 
 def likely_pairs(corners: Mapping[int, Corners]) -> list[tuple[int, int]]:
-    """Return pairs of views that have most in common, in terms of their clearest corners."""
+    """Return pairs of views that have most in common, judged by their clearest corners."""
     views, count = sorted(corners), len(corners)
     few = torch.zeros(count, FEW_CORNERS, max((c.descriptor.shape[1] for c in corners.values()), default=0))
     for number, view in enumerate(views):
@@ -133,12 +133,12 @@ def _plane(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Float[
 def nearest_views(
     c2w: Float[Tensor, "all 3 4"], views: Int[Tensor, "views"], others: Int[Tensor, "others"], most: int
 ) -> Int[Tensor, "views nearest"]:
-    """Return for each of some views up to `most` of the others, itself left out, that stand near and look its way.
+    """Return for each view up to `most` of the others, except itself, that are near and look in its direction.
 
-    The nearest comes first; half of the distance that others usually have counts as much as 30 degrees.
+    The nearest comes first; half of the usual distance to the others counts as much as 30 degrees.
     """
     away = torch.cdist(c2w[views, :, 3], c2w[others, :, 3])
-    # Cameras side by side that look elsewhere share nothing.
+    # Adjacent cameras that look in different directions share nothing.
     turned = torch.cdist(c2w[views, :, 2], c2w[others, :, 2])
     apart = away / away.mean(dim=1, keepdim=True).clamp(min=1e-12) + turned
     apart[views[:, None] == others] = torch.inf

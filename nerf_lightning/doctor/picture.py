@@ -1,6 +1,7 @@
-"""What a person sees of an examined capture: one line, its cameras with the verdicts, and the proofs of the verdicts.
+"""Show an examined capture: one line, its cameras with the verdicts, and the proofs of the verdicts.
 
-A ray through a detail of one photograph is a line in another. With the right poses the line passes the same detail.
+A ray through a detail of one photograph is a line in another. With the right poses the line passes through the same
+detail.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,16 +29,16 @@ WIDEST = 130
 VERDICTS = {"ok": "#3c9d6b", "look": "#d9a400", "wrong": "#c8372d", "not judged": "0.5"}
 MOST_PROOFS, MOST_DETAILS = 4, 7
 COLORS = ("#ff2d2d", "#ffd500", "#2dff5a", "#2dd5ff", "#ff7bf2", "#ff9a2d", "#b39dff")
-# Pixels of the longer side of a photograph, and of a row of the picture.
+# Longer side of a photograph in pixels, and that of a row of the picture.
 LONGER_SIDE, PANEL = 600, 480
-# Of the distance between both cameras: the part of a ray that is drawn.
+# In units of the distance between both cameras: the drawn part of a ray.
 NEAREST, FARTHEST, STEPS = -1.5, 3.0, 400
 
 
 def about_capture(scene: Scene, place: str | None, form: str) -> str:
-    """Return what was examined, in one line: which folder, read as which format, how many photographs of what size.
+    """Return one line about what was examined: the folder, its format, the number and size of photographs.
 
-    `place` is the folder or file that it was read from, if any, and `form` how scene= names the format.
+    `place` is the folder or file that it was read from, if any, and `form` the name of the format for scene=.
     """
     pixels = scene.pixels
     sizes = sorted(set(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)))
@@ -48,7 +49,7 @@ def about_capture(scene: Scene, place: str | None, form: str) -> str:
 
 
 def shares(splits: Mapping[str, Sequence[int]], num_views: int) -> str:
-    """Return how the views are shared out; the numbers add up to all of them.
+    """Return how the views are split; the numbers add up to all of them.
 
     >>> shares({"train": (1, 2), "val": (0,), "test": (0,)}, 3)
     '2 train, 1 held out for val and test'
@@ -98,7 +99,7 @@ def _write_verdicts(axes: "Axes", checks: Sequence[Check]) -> None:
 
 
 def proof_picture(scene: Scene, proofs: Sequence[Proof]) -> UInt8[Tensor, "height width 3"]:
-    """Return a row for each of the first proofs: details of one photograph, their lines in another, given and right."""
+    """Return a row per proof: details of one photograph, and their lines in another with given and fitted cameras."""
     shown = proofs[:MOST_PROOFS]
     figure = new_figure(3 * PANEL, PANEL * len(shown) + 40)
     panels = figure.subplots(len(shown), 3, squeeze=False)
@@ -139,7 +140,7 @@ def _draw_proof(row: Sequence["Axes"], scene: Scene, proof: Proof, size: list[Te
 
 
 def spread_out(matches: Matches, most: int) -> Matches:
-    """Return a few matches that lie far from each other in the first picture."""
+    """Return a few matches that are far from each other in the first picture."""
     place, chosen = matches.plane[:, 0], [0]
     while len(chosen) < min(most, len(place)):
         apart = torch.cdist(place, place[chosen]).amin(dim=1)
@@ -155,7 +156,7 @@ def _missed(matches: Matches, cameras: Cameras, zoom: float = 1.0) -> str:
 
 
 def _places_in(cameras: Cameras, matches: Matches, side: int) -> Float[Tensor, "details 2"]:
-    """Return where matched details lie in one of the two photographs, in pixels."""
+    """Return the places of matched details in one of the two photographs, in pixels."""
     view, plane = int(matches.view[0, side]), matches.plane[:, side]
     local = torch.stack([plane[:, 0], -plane[:, 1], -torch.ones(len(plane))], dim=-1)
     return project(cameras, view, cameras.c2w[view, :, 3] + local @ cameras.c2w[view, :, :3].T)
@@ -171,13 +172,13 @@ def _mark(axes: "Axes", places: Float[Tensor, "details 2"]) -> None:
 
 
 def _draw_lines(axes: "Axes", cameras: Cameras, matches: Matches, zoom: float) -> None:
-    """Draw the rays through the first places as the second camera sees them."""
+    """Draw the rays through the first places as seen by the second camera."""
     view, other = matches.view[0].tolist()
     rays, between = rays_of(matches, cameras.c2w, zoom)
     along = float(between[0].norm()) * torch.logspace(NEAREST, FARTHEST, STEPS)
     points = cameras.c2w[view, :, 3] + along[:, None, None] * rays[:, 0].float()
     local = camera_coordinates(cameras, other, points)
-    # Far outside the picture a lens may fold back, and places there mean nothing.
+    # Far outside the picture a lens may fold back, and places there are meaningless.
     plane = local[..., :2].abs() / -local[..., 2:]
     reach = torch.stack([cameras.width[other], cameras.height[other]]) / cameras.focal[other]
     drawn = (local[..., 2] < 0) & (cameras.lens_model == "fisheye" or (plane < 0.7 * reach).all(dim=-1))

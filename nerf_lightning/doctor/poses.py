@@ -1,4 +1,4 @@
-"""Checks of the poses against the pixels: places that photographs share must lie where the cameras say."""
+"""Checks of the poses against the pixels: places that photographs share must agree with the cameras."""
 
 from dataclasses import replace
 from functools import partial
@@ -20,30 +20,31 @@ from nerf_lightning.doctor.second_opinion import (
     with_pose,
 )
 
-FEWEST = 200  # Matches below which nothing is said of the whole capture
-# More matches than these are thinned out to try other readings.
+FEWEST = 200  # Minimum number of matches to judge the whole capture
+# Maximum number of matches used to try other readings.
 ENOUGH = 5000
-# The largest pair of a view, as a share of the usual, from which on a view is judged; and its share of agreeing
-# matches, of the usual, below which its pose is wrong.
+# Size of a view's largest pair, relative to the usual, from which on a view is judged; and its share of agreeing
+# matches, relative to the usual, below which its pose is wrong.
 CLEAR_PAIR, ODD = 0.4, 0.45
 # Shares of matches that agree. Right poses reach 0.6 to 0.9; wrong ones 0.03 to 0.3 by chance.
 SOUND, HOPELESS = 0.5, 0.3
-# Another reading must explain so much more.
+# Another reading must explain this much more.
 BETTER = 0.1
 ZOOMS = (0.25, 0.33, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.4, 1.7, 2.0, 3.0, 4.0)
-# By which the focal length may be off before it is noted, and before it is wrong.
+# Relative errors of the focal length from which on it is noted, and wrong.
 OFF, FAR_OFF = 1.15, 1.35
 CLEARER = 0.01
-# Contradicted views of which a better pose is looked for, and told of.
+# Maximum number of contradicted views for which a better pose is searched, and reported.
 MOST_REFITTED, MOST_TOLD = 20, 3
-# Pairs of photographs that must be clear before all poses are wrong, and the share of them that contradicts the poses.
+# Minimum number of clear pairs of photographs to judge all poses wrong, and the share of them that contradicts the
+# poses.
 FEWEST_CLEAR, MOST_AGAINST = 4, 0.8
 DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; more or larger photographs help to tell."
 TOO_FEW = "too few details could be found again from one photograph to another"
 
 
 def poses_and_pixels(evidence: Evidence) -> Check:
-    """Judge whether the poses explain what photographs have in common."""
+    """Judge whether the poses explain what photographs share."""
     share, count = evidence.agreement, len(evidence.matches.view)
     if count < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
@@ -54,7 +55,7 @@ def poses_and_pixels(evidence: Evidence) -> Check:
 
 
 def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
-    """Judge all poses by pairs of photographs whose details are no mistakes, since most matches do not agree."""
+    """Judge all poses by pairs of photographs whose matches are certain, since most matches do not agree."""
     pairs = clear_pairs(evidence.matches, evidence.scene.cameras)
     against = [proof for contradicts, proof in pairs if contradicts]
     if len(pairs) < FEWEST_CLEAR:
@@ -100,7 +101,7 @@ def single_poses(evidence: Evidence) -> Check:
     if len(matches.view) < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
     if evidence.agreement < SOUND:
-        # Of which the poses as a whole may be guilty or not: poses_and_pixels tells.
+        # The poses as a whole may be the cause: poses_and_pixels decides.
         share = f"{100 * evidence.agreement:.0f} % of matched details lie where the cameras say"
         return not_judged(f"only {share}, too few to tell one view from another", DOUBTFUL)
     bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
@@ -151,13 +152,13 @@ def _proof_of(evidence: Evidence, pose: BetterPose) -> tuple[Proof, ...]:
 
 
 def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
-    """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
+    """Return views that contradict the rest, the worst first; how many could be judged; and their minimum share.
 
-    They are found one at a time; the matches of each are left out from then on, so that its neighbors do not suffer
-    for it. `good` are the matches that lie where the cameras say.
+    They are found one at a time; the matches of each are then ignored, so that they do not count against its neighbors.
+    `good` are the matches that agree with the cameras.
     """
     shares, largest = shares_of_views(matches, good, num_views)
-    # From photographs that share little, most matches are mistakes: they accuse nobody.
+    # Of photographs that share little, most matches are mistakes: they prove nothing.
     clear = CLEAR_PAIR * largest[largest > 0].median()
     judged, least = int((largest >= clear).sum()), float(shares[largest >= clear].min())
     usual, bad = shares[largest >= clear].median(), []
@@ -175,9 +176,9 @@ def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -
 def shares_of_views(
     matches: Matches, good: Bool[Tensor, "matches"], num_views: int
 ) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
-    """Return for each view which share of its matches agree, and how many its largest pair has.
+    """Return for each view the share of its matches that agree, and the size of its largest pair.
 
-    Only the larger pairs of each view count: from pictures that show different things, matches are mistakes.
+    Only the larger pairs of each view count: matches of pictures that show different things are mistakes.
     """
     pair = matches.view[:, 0] * num_views + matches.view[:, 1]
     _, number, size = pair.unique(return_inverse=True, return_counts=True)
@@ -195,7 +196,7 @@ def shares_of_views(
 
 
 def thinned(matches: Matches, most: int) -> Matches:
-    """Return at most so many of the matches, evenly."""
+    """Return at most `most` of the matches, evenly spread."""
     step = -(-len(matches.view) // most) or 1
     return matches.where(slice(None, None, step))
 
@@ -203,11 +204,11 @@ def thinned(matches: Matches, most: int) -> Matches:
 def fitting_pose(
     matches: Matches, c2w: Float[Tensor, "views 3 4"], view: int, suspects: list[int], least: float
 ) -> int | None:
-    """Return the suspect whose camera fits this view's photograph, if one does: the two were mixed up."""
+    """Return the suspect whose camera fits this view's photograph, if any: the two were mixed up."""
     own = matches.where((matches.view == view).any(dim=1))
     best, best_share = None, least
     for other in suspects:
-        # A match with the view whose camera is tried says nothing: the centers would coincide.
+        # A match with the view whose camera is tried proves nothing: the centers would coincide.
         free = own.where(~(own.view == other).any(dim=1))
         if other == view or len(free.view) < 20:
             continue
@@ -222,7 +223,7 @@ def _share(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0)
 
 
 def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
-    """Judge whether one of other readings of the capture explains the pixels better; `fine`: what holds if not."""
+    """Judge whether another reading of the capture explains the pixels better; `fine`: the message if not."""
     scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
     if len(matches.view) < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)

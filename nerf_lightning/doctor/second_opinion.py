@@ -1,7 +1,7 @@
 """A second opinion on a view that its neighbors contradict: only a pose that fits better proves that its own is wrong.
 
-Details that repeat, stripes around a can and outlines that slide over a smooth surface make matches that contradict
-right poses, too. They give themselves away: no other pose explains them, or the views that stand nearest agree.
+Repeated details, stripes around a can and outlines that slide over a smooth surface cause matches that contradict right
+poses, too. They can be recognized: no other pose explains them, or the nearest views agree.
 """
 
 from dataclasses import dataclass, replace
@@ -18,42 +18,43 @@ from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs, nearest
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.types.scene import Cameras
 
-# The other pose must explain so many details that the given one does not, of so many from each of two other views.
+# Minimum number of details that the other pose must explain and the given one does not, and that from each of two other
+# views.
 FEWEST, FEWEST_OF_A_PAIR = 24, 8
 # It must explain this share of what right poses of this capture usually explain, and most of the matches: less may be
-# the other side of a thing whose sides look alike.
+# the other side of an object whose sides look alike.
 CONVINCING, MOST = 0.6, 0.55
-# The views nearest by the given poses speak for a pose with as many details and this share of the usual.
+# The nearest views by the given poses support a pose with as many details and this share of the usual.
 NEAREST, FEWEST_FOR, SPEAKS_FOR = 4, 20, 0.7
-# From where the search begins: the poses of the view and of so many suspects, and of so many views that share most.
+# Starting points of the search: the poses of the view, of this many suspects, and of this many views that share most.
 MOST_MIXED, STARTS = 8, 4
-# So many of the largest pairs are looked at, with so many matches each.
+# Maximum number of the largest pairs that are examined, and of matches of each.
 MOST_PAIRS, FEWEST_IN_PAIR = 16, 30
-# The share of a pair's matches that two free cameras explain, from which on they are no mistakes; the share of these
-# that the poses must explain; and radians between most rays, without which any place of the camera would do.
+# Minimum share of a pair's matches that two free cameras explain if they are not mistakes; the share of these that the
+# poses must explain; and radians between most rays, below which the camera's position is undetermined.
 CLEAR, AGREES, LEAST_PARALLAX = 0.65, 0.5, 0.03
-# Rounds of a fit, and pixels beyond which a match counts less and less, at the first round and at the last.
+# Iterations of a fit, and pixels beyond which a match counts less and less, in the first and in the last iteration.
 ROUNDS, WIDE, NARROW = 20, 16.0, 1.0
 
 
 @dataclass(frozen=True)
 class BetterPose:
-    """Where a photograph was taken from, as the details say that it shares with others."""
+    """The pose of a photograph according to the details that it shares with others."""
 
     view: int
     pose: Float[Tensor, "3 4"]
     neighbors: tuple[int, ...]
-    """The views that speak for it, the one with most details first."""
+    """The views that support it, the one with most details first."""
     explained: float
-    """Share of the view's matches that lie where this pose says."""
+    """Share of the view's matches that agree with this pose."""
     before: float
-    """The same share with the given pose."""
+    """The same share for the given pose."""
     degrees: float
-    """By which the given pose is turned away from it."""
+    """Rotation between the given pose and this one."""
 
 
 def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
-    """Return whether the views that stand nearest, of `others` that nothing is said against, agree with a view."""
+    """Return whether the nearest of `others`, which are not contradicted, agree with a view."""
     c2w = evidence.scene.cameras.c2w
     known = torch.tensor([other for other in others if other in evidence.corners], dtype=torch.long)
     pairs = [(view, other) for other in nearest_views(c2w, torch.tensor([view]), known, NEAREST)[0].tolist()]
@@ -65,7 +66,7 @@ def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
 def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPose | None:
     """Return the pose that explains what a view shares with others, if one does and the given one does not.
 
-    What the view shares with `suspects`, all views that are contradicted, proves nothing.
+    What the view shares with `suspects`, all contradicted views, proves nothing.
     """
     c2w, own = evidence.scene.cameras.c2w, _of_view(evidence.matches, view, suspects)
     partner = own.view[:, 1]
@@ -87,7 +88,7 @@ def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPos
 
 
 def _of_view(matches: Matches, view: int, suspects: list[int]) -> Matches:
-    """Return a view's matches with its larger partners that are no suspects, the view itself first."""
+    """Return a view's matches with its larger partners that are not suspects, the view itself first."""
     matches = matches.with_first(view)
     partner = matches.view[:, 1]
     allowed, size = ~torch.isin(partner, torch.tensor(suspects)), torch.bincount(partner)[partner]
@@ -100,17 +101,18 @@ def _starts(own: Matches, c2w: Float[Tensor, "views 3 4"], suspects: list[int]) 
     others, counts = partner.unique(return_counts=True)
     others = others[counts.argsort(descending=True)][:STARTS]
     middle = c2w[others, :, 3].mean(dim=0)
-    # Beside the partner: at its very place no ray of both would meet.
+    # Next to the partner: at the same position, their rays would not meet.
     beside = torch.cat([c2w[others, :, :3], (0.8 * c2w[others, :, 3] + 0.2 * middle)[:, :, None]], dim=-1)
-    # Poses that were mixed up are those of other suspects; the view itself is one.
+    # Mixed-up poses are those of other suspects; the view itself is one.
     mixed = [view, *(suspect for suspect in suspects[:MOST_MIXED] if suspect != view)]
     return torch.cat([c2w[mixed], beside])
 
 
 def clear_pairs(matches: Matches, cameras: Cameras) -> list[tuple[bool, Proof]]:
-    """Return the clear ones among the largest pairs, the largest first; `cameras` are those that are judged.
+    """Return the clear ones of the largest pairs, the largest first; `cameras` are judged.
 
-    For each: whether the poses do not explain most of what fits, and what fits, with how the two cameras stand.
+    For each: whether the poses fail to explain most of the fitting matches, and those that contradict them (all, if
+    none do), with the fitted cameras.
     """
     _, pair, count = matches.view.unique(dim=0, return_inverse=True, return_counts=True)
     largest = [
@@ -122,7 +124,7 @@ def clear_pairs(matches: Matches, cameras: Cameras) -> list[tuple[bool, Proof]]:
 
 def _judged(matches: Matches, cameras: Cameras) -> tuple[bool, Proof] | None:
     view, other = matches.view[0].tolist()
-    # The other camera where it is; this one turned alike and a step beside it, to any of six sides.
+    # The other camera is fixed; this one has the same rotation and is a step away, in any of six directions.
     there = cameras.c2w[other].double()
     steps = torch.cat([torch.eye(3), -torch.eye(3)]).double()
     centers = cameras.c2w[:, :, 3]
@@ -147,10 +149,10 @@ def _judged(matches: Matches, cameras: Cameras) -> tuple[bool, Proof] | None:
 def refitted(
     own: Matches, c2w: Float[Tensor, "views 3 4"], starts: Float[Tensor, "starts 3 4"]
 ) -> Float[Tensor, "starts 3 4"]:
-    """Return each start after Gauss-Newton steps on how far matches lie from the planes of their partners' rays.
+    """Return each start after Gauss-Newton steps on the distances of matches from the planes of their partners' rays.
 
-    Large distances count less and less (Cauchy's weights, ever narrower), since a part of the matches is mistaken. The
-    matches are of one view, it first in each, and the poses of the others are taken for right.
+    Large distances count less and less (Cauchy weights, ever narrower), since some of the matches are wrong. The
+    matches are of one view, which comes first in each, and the poses of the others are assumed to be right.
     """
     rays, _ = rays_of(own, c2w)
     there, focal = rays[:, 1], own.focal[:, 0].double()

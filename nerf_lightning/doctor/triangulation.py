@@ -1,7 +1,7 @@
-"""Known distances for captures that bring none: what photographs show alike, triangulated at the given cameras.
+"""Distances for captures without any: triangulate matches of photographs with the given cameras.
 
-Without them, few photographs leave open where things are: of 14 photographs of a cup, 600 steps make 16 dB, and 25 dB
-with them (docs/measurements.md). Held-out photographs are not looked at.
+Without them, few photographs do not determine where things are: with 14 photographs of a cup, 600 steps reach 16 dB,
+and 25 dB with them (docs/measurements.md). Held-out photographs are not used.
 """
 
 import logging
@@ -21,18 +21,18 @@ from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.rays import KnownDepths
 from nerf_lightning.nerf.types.scene import Scene
 
-LONGER_SIDE, MOST_CORNERS = 576, 2000  # Twice as fine as for checks: distances are as exact as corners are.
-PARTNERS = 6  # Views that each is matched with,
-MOST_VIEWS = 200  # evenly spread where there are more.
-LEAST_ERROR = 0.7  # Pixels of the shrunk pictures: no corner is found more exactly.
-LEAST_AGREEING = 0.15  # Share of the matches that agree with the cameras: 0.29 to 0.71, of wrong cameras at most 0.04.
+LONGER_SIDE, MOST_CORNERS = 576, 2000  # Twice as fine as for checks: distances are as accurate as corners.
+PARTNERS = 6  # Number of views that each is matched with,
+MOST_VIEWS = 200  # evenly spread if there are more.
+LEAST_ERROR = 0.7  # Pixels of the shrunk pictures: no corner is found more accurately.
+LEAST_AGREEING = 0.15  # Share of the matches that agree with the cameras: 0.29 to 0.71; if wrong, at most 0.04.
 FEWEST = 10  # Distances per view.
 
 log = logging.getLogger(__name__)
 
 
 def with_distances(scene: Scene) -> Scene:
-    """Return the scene with the distances that its training views tell, if it knows none and they tell enough."""
+    """Return the scene with distances from its training views, if it has none and they yield enough."""
     if scene.depths is not None or scene.capture_of is not None:
         return scene
     with torch_threads(1):  # Pictures are spread over our own threads.
@@ -41,7 +41,7 @@ def with_distances(scene: Scene) -> Scene:
 
 
 def triangulated(scene: Scene) -> KnownDepths | None:
-    """Return the distances of corners that two training views show, and that their cameras explain; None: few."""
+    """Return the distances of corners that two training views show and their cameras explain; None if there are few."""
     views = evenly_spaced_subset(scene.splits["train"], MOST_VIEWS)
     cameras, shown = shrunk_cameras(scene.cameras, LONGER_SIDE), len(views) > NOTICEABLE
 

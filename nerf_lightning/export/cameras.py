@@ -1,4 +1,4 @@
-"""The cameras, in the user's frame, as other programs read them: `transforms.json` and a COLMAP model."""
+"""Export the cameras, in the user's frame, for other programs: `transforms.json` and a COLMAP model."""
 
 import logging
 import math
@@ -29,17 +29,17 @@ CAMERA_MODELS: dict[LensModel, str] = {
     "equirectangular": "EQUIRECTANGULAR",
 }
 MADE_BY = {"made_by": "nerf export what=cameras"}
-WHOLE = 1e-3  # Of a panorama's size, to which it shows all directions.
+WHOLE = 1e-3  # Tolerance, relative to a panorama's size, within which it shows all directions.
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 COLMAP_TAKES = {"pinhole": [], "radial_tangential": [0, 1, 4, 5], "fisheye": [0, 1, 2, 3]}
-"""Which of the coefficients each of COLMAP's models has, in its order."""
+"""The coefficients of each of COLMAP's models, in its order."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class CamerasExport(Export):
-    """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the pictures of the training.
+    """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text) for the training pictures.
 
     Args:
         images: folder of the photographs, relative to the JSON file, prefixed to each name; None: the recorded names.
@@ -89,7 +89,7 @@ def _require_own(transforms: Path, *others: Path) -> None:
 
 
 def in_user_frame(record: SceneRecord) -> Cameras:
-    """Return the cameras as the user's frame has them, in float64."""
+    """Return the cameras in the user's frame, in float64."""
     cameras = record.cameras.map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
     back = torch.linalg.inv(record.to_user.double())
     changed = dict(vars(cameras)) | {"c2w": poses_from_user(cameras.c2w, back), "ndc": None}
@@ -112,7 +112,7 @@ def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
 
 
 def beyond_colmap(cameras: Cameras) -> str | None:
-    """Return why COLMAP has no model for a lens, or None where it has."""
+    """Return why COLMAP has no model for a lens; None if it has one."""
     if cameras.lens_model == "equirectangular" and not bool(_is_whole(cameras).all()):
         return "COLMAP has no model for panoramas of a part of the directions."
     if cameras.lens_model == "radial_tangential" and bool(cameras.lens[:, 2:4].any()):
@@ -121,16 +121,16 @@ def beyond_colmap(cameras: Cameras) -> str | None:
 
 
 def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
-    """Return name -> text; views with the same intrinsics share a camera.
+    """Return the text of each file by name; views with the same intrinsics share a camera.
 
     Raises:
-        InputError: a photograph's name that would end its line.
+        InputError: a photograph's name would break its line.
     """
     numbers: dict[str, int] = {}
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of features (none)"]
     for view, name in enumerate(names):
         camera = numbers.setdefault(_camera(cameras, view), len(numbers) + 1)
-        require_printable(name, f"photograph {view}")  # it ends a line
+        require_printable(name, f"photograph {view}")  # it is at the end of a line
         images += [f"{view + 1} {_pose(cameras, view)} {camera} {name}", ""]
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {text}" for text, number in numbers.items())]
     return {

@@ -28,7 +28,7 @@ from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]
 Split = Literal["train", "val", "test", "all"]
-OPAQUE = 0.5  # Pixels that stop less light have no depth.
+OPAQUE = 0.5  # Pixels with lower opacity have no depth.
 LARGEST = 65_535
 KINDS = ("depth", "opacity", "normals")
 MILLIMETRE = 1e-3
@@ -40,8 +40,8 @@ class ImagesExport(Export):
 
     Each channel of the model's field has a folder of float32 .npy arrays.
 
-    Where the capture's unit is known, depth is in meters, and the PNG in millimeters as depth cameras write it, unless
-    something lies further away than these reach.
+    If the capture's unit is known, depth is in meters, and the PNG in millimeters like that of depth cameras, unless
+    something is farther away than its range.
 
     Args:
         split: the split whose views are exported.
@@ -62,7 +62,7 @@ class ImagesExport(Export):
     def export(
         self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
     ) -> list[Path]:
-        """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
+        """Write the pictures; all share one depth scale, so the PNG files come last."""
         require_free(files=[folder / "images.json"], folders=[folder / name for name in KINDS])
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)
@@ -124,14 +124,14 @@ class ImagesExport(Export):
 
 
 def _file_name(view: int, name: str) -> str:
-    """Return what the files of a view are called, without their ending and that of the photograph."""
+    """Return the name of a view's files, without their extension and that of the photograph."""
     ending = Path(name).suffix
     stem = name.removesuffix(ending) if ending.lower() in ENDINGS else name
     return file_name(f"{view:04d}_{stem}", ".png").removesuffix(".png")
 
 
 def _save_array(path: Path, array: Float[ndarray, "height width *channels"]) -> None:
-    # Given a file, numpy writes through buffers of C's, and says nothing where the disk is too full for the last one.
+    # Given a file, NumPy writes through C buffers, and reports nothing if the disk is too full for the last one.
     content = io.BytesIO()
     np.save(content, array)
     with whole_file(path) as part:

@@ -1,4 +1,4 @@
-"""What the photographs show: where the light of each pixel was stopped, and whether views agree."""
+"""Compute what the photographs show: where each pixel's light was absorbed, and whether views agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
-# Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals; and
-# where rays go through normalized device coordinates.
+# Bytes per pixel, measured on the CPU: all rays of a view, their rendering, and their points and normals; and the same
+# for rays in normalized device coordinates.
 STRAIGHT, BENT = 250, 370
 
 
@@ -28,16 +28,16 @@ class SeenView:
     rgb: Float[Tensor, "height width 3"]
     opacity: Float[Tensor, "height width"]
     depth: Float[Tensor, "height width"]
-    """Distance along the ray at which the stopped light was stopped."""
+    """Distance along the ray at which the light was absorbed."""
     points: Float[Tensor, "height width 3"]
     normals: Float[Tensor, "height width 3"]
-    """Unit, facing the camera; zero where the depth has no slope to speak of."""
+    """Unit normals facing the camera; zero where the depth has no reliable slope."""
     channels: dict[str, Float[Tensor, "height width _"]]
-    """What else the model's field says, by name."""
+    """Other outputs of the model's field, by name."""
 
 
 def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse views whose rays take more memory than can be had, before the first of them is made."""
+    """Refuse views whose rays need more memory than is available, before the first one is rendered."""
     each = BENT if cameras.ndc is not None else STRAIGHT
     sizes = {view: int(cameras.width[view]) * int(cameras.height[view]) for view in views}
     view = max(sizes, key=lambda view: sizes[view])
@@ -51,7 +51,7 @@ def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -
 
 
 def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
-    """Render one view; `cameras` are the record's, at whatever size."""
+    """Render one view; `cameras` are the record's, at any size."""
     rays_of = RayGenerator(cameras, record.near, record.far, names_photographs=model.needs_photographs)
     picture = render_picture(model, rays_of, view, record.background, tile_points)
     depth, points = picture_surface(rays_of, view, picture)
@@ -60,7 +60,7 @@ def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_poi
 
 
 def nearest_views(cameras: Cameras, view: int, others: Sequence[int], count: int) -> list[int]:
-    """Return those of the other views that were taken from nearest."""
+    """Return the `count` nearest of the other views."""
     rest = [other for other in others if other != view]
     apart = (cameras.c2w[rest, :, 3] - cameras.c2w[view, :, 3]).norm(dim=-1)
     return [rest[i] for i in apart.argsort()[:count].tolist()]
@@ -75,8 +75,8 @@ def num_agreeing(
 ) -> Int[Tensor, "points"]:
     """Return how many of the views see each point, in the working frame, as their surface.
 
-    `depths` are along each pixel's ray to the surface (scene units), inf where nothing opaque is seen. A point may lie
-    off it by `tolerance` times its distance.
+    `depths` are along each pixel's ray to the surface (scene units), inf where nothing opaque is seen. A point may be
+    off by `tolerance` times its distance.
     """
     count = torch.zeros(len(points), dtype=torch.int64)
     for view in views:

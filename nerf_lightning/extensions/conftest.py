@@ -10,7 +10,7 @@ from nerf_lightning.extensions.splats import initialize
 
 @pytest.fixture(autouse=True)
 def few_looks_around() -> Iterator[None]:
-    """Splats begin with fewer views of the field than a person's."""
+    """Splats begin with fewer views of the field than by default."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(initialize, "COUNT", 16)
         yield

@@ -1,4 +1,4 @@
-"""Zip archives, which PyTorch and numpy write: files that are exactly one, so that all readers see the same in them."""
+"""Zip archives, which PyTorch and NumPy write: files that are exactly one, so that all readers see the same content."""
 
 import io
 import os
@@ -7,18 +7,18 @@ import struct
 from nerf_lightning.files.trust import Mismatch
 
 END, END64, LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
-"""What an archive ends with; the records of zip64 (the latter two), where there are any, come first."""
+"""The records at the end of an archive; those of zip64 (the latter two), if any, come first."""
 
 
 def start_of_directory(file: io.BufferedReader, most_bytes: int) -> int:
-    """Return where the directory of a file's one archive begins.
+    """Return the offset of the directory of a file's only archive.
 
     Args:
-        file: it has one end record, at its end, whose offsets count from its beginning.
-        most_bytes: the largest size of the directory.
+        file: must have one end record, at its end, whose offsets count from its beginning.
+        most_bytes: maximum size of the directory.
 
     Raises:
-        Mismatch: it has not, or is no archive.
+        Mismatch: it does not, or is not an archive.
     """
     size, records = os.fstat(file.fileno()).st_size, END64.size + LOCATOR.size
     file.seek(max(0, size - records - END.size))
@@ -28,7 +28,7 @@ def start_of_directory(file: io.BufferedReader, most_bytes: int) -> int:
     if tail.startswith(b"PK\x06\x07", END64.size):
         end -= records
         mark64, *_, length64, offset64 = END64.unpack_from(tail)
-        # The fields of 32 bits may leave the numbers to those of 64.
+        # The 32-bit fields may defer to the 64-bit ones.
         same = length in (length64, 0xFFFFFFFF) and offset in (offset64, 0xFFFFFFFF)
         if mark64 != b"PK\x06\x06" or LOCATOR.unpack_from(tail, END64.size)[2] != end or not same:
             raise Mismatch("it", "is not one archive: its end records contradict each other")

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there."""
+"""Files that are either complete or absent."""
 
 import errno
 import os
@@ -22,7 +22,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-NO_ROOM = (*FULL, errno.EFBIG)  # A file may also be larger than is allowed
+NO_ROOM = (*FULL, errno.EFBIG)  # A file may also be larger than allowed
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"  # Folders are shared between machines
 PATIENCE_SECONDS, PAUSE_SECONDS = 1.0, 0.05
 PART = re.compile(r"\..*\.(\d{1,9})_([0-9a-f]{8})\.nerf_lightning\.part(\.[^.]+)?", re.DOTALL)
@@ -30,32 +30,32 @@ PART = re.compile(r"\..*\.(\d{1,9})_([0-9a-f]{8})\.nerf_lightning\.part(\.[^.]+)
 
 @contextmanager
 def whole_file(path: Path, mode: int = 0o666) -> Iterator[Path]:
-    """Lend a temporary path next to `path` that takes its place when the block ends well, else is removed.
+    """Yield a temporary path next to `path` that replaces it if the block succeeds, and is removed otherwise.
 
-    A missing folder is made; below one that the user named, `make_folder` does it first, and refuses links. The
-    temporary name keeps the suffix, since writers choose a format by it. What killed processes left in the folder is
-    removed.
+    A missing folder is made; below one that the user named, `make_folder` makes it first, and refuses links. The
+    temporary name keeps the suffix, since writers choose a format by it. Leftovers of killed processes in the folder
+    are removed.
     """
     make_folder(path.parent)
     remove_leftovers(path.parent)
     part = path.with_name(f".{path.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{path.suffix}")
     try:
-        part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
+        part.unlink(missing_ok=True)  # writing would follow a link of this name, planted or left over
         with full_disk_named(path), _held(part, mode):
             yield part
             persistently(os.replace, part, path)
     except OSError as error:
         if error.errno is not None and error.filename is None:
-            error.filename = str(path)  # what is wrong with a disk is not said of any file
+            error.filename = str(path)  # disk errors name no file
         raise
     finally:
         part.unlink(missing_ok=True)
 
 
 def persistently(change: Callable[..., None], *arguments: Any) -> None:
-    """Rename or remove a file; where that is not permitted, try again for a second.
+    """Rename or remove a file; if that is not permitted, retry for a second.
 
-    Windows does not permit it while another process has the file open: a reader of ours, a virus scanner, a backup.
+    Windows does not permit it while another process has the file open: one of our readers, a virus scanner, a backup.
     """
     end = time.monotonic() + PATIENCE_SECONDS
     while True:
@@ -69,9 +69,9 @@ def persistently(change: Callable[..., None], *arguments: Any) -> None:
 
 @contextmanager
 def full_disk_named(place: Path) -> Iterator[None]:
-    """Say of a full disk, a spent quota, or a file that may not grow, where it is: `place`, if nothing nearer is known.
+    """Name the location of a full disk, an exhausted quota or a file-size limit: `place`, if nothing closer is known.
 
-    The system says it of no file; a copy says it of the file that it reads.
+    The system names no file; a copy names the file that it reads.
     """
     try:
         yield
@@ -83,7 +83,7 @@ def full_disk_named(place: Path) -> Iterator[None]:
 
 @contextmanager
 def _held(part: Path, mode: int) -> Iterator[None]:
-    """Make the file, and hold it locked: its writer is alive."""
+    """Make the file, and keep it locked while its writer is alive."""
     if fcntl is None:
         yield
         return
@@ -93,7 +93,7 @@ def _held(part: Path, mode: int) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX)
         if _is_at(handle, part):
             break
-        os.close(handle)  # another process took it for a dead one's, and removed it
+        os.close(handle)  # another process considered its writer dead and removed it
     try:
         yield
     finally:
@@ -101,7 +101,7 @@ def _held(part: Path, mode: int) -> Iterator[None]:
 
 
 def _is_at(handle: int, path: Path) -> bool:
-    """Return whether an open file is still the one of this name."""
+    """Return whether an open file is still the one at this path."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path, follow_symlinks=False))
     except FileNotFoundError:
@@ -110,15 +110,15 @@ def _is_at(handle: int, path: Path) -> bool:
 
 @cache
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files whose writers are dead, once in a process's life."""
+    """Remove the temporary files whose writers are dead, once per process."""
     for part in folder.iterdir():
         if (name := PART.fullmatch(part.name)) and part.is_file():
-            with suppress(OSError):  # held by another process, gone meanwhile, or another user's
+            with suppress(OSError):  # held by another process, already gone, or another user's
                 _remove_dead(part, has_ended=name[2] == MACHINE and not psutil.pid_exists(int(name[1])))
 
 
 def _remove_dead(part: Path, has_ended: bool) -> None:
-    """Remove a temporary file unless its writer holds the lock; where there are no locks, if its process has ended."""
+    """Remove a temporary file unless its writer holds the lock; without locks, if its process has ended."""
     if fcntl is None:
         if has_ended:
             part.unlink()

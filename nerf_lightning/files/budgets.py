@@ -1,7 +1,7 @@
-"""What a file may cost before the user agrees: the one table of limits, for each container its bytes and its elements.
+"""What a file may cost without the user's consent: one table of limits on bytes and elements of each container.
 
-Files come from anybody. Each limit is far above what valid files need, and low enough that no file fills the memory or
-runs for hours. Users raise limits on the command line (`budgets.views=500000`); no file can.
+Files are untrusted. Each limit is far above what valid files need, and low enough that no file fills the memory or
+takes hours. Users raise limits on the command line (`budgets.views=500000`); files cannot.
 """
 
 import math
@@ -14,14 +14,14 @@ from nerf_lightning.messages.errors import InputError
 
 @dataclass(frozen=True)
 class Budgets:
-    """Limits on what is read: `KIND_bytes` of a file of each kind, and the elements that it may hold."""
+    """Limits on what is read: `KIND_bytes` of a file of each kind, and its number of elements."""
 
     json_bytes: int = 1 << 26
     json_values: int = 4_000_000  # keys and values, counted by commas, colons and opening brackets
     xml_bytes: int = 1 << 26
     xml_values: int = 2_000_000  # tags and attributes
     yaml_bytes: int = 1 << 20
-    yaml_values: int = 100_000  # keys and values, counted by what begins or parts them
+    yaml_values: int = 100_000  # keys and values, counted by what begins or separates them
     text_bytes: int = 1 << 24  # of a list of names or numbers, and of one line of a larger text
     text_values: int = 2_000_000  # words and lines
     ply_bytes: int = 1 << 32
@@ -59,22 +59,22 @@ class _Now:
 
 
 def limits() -> Budgets:
-    """Return the budgets that hold in this process."""
+    """Return the budgets of this process."""
     return _Now.budgets
 
 
 def set_limits(budgets: Budgets) -> None:
-    """Let these budgets hold from now on."""
+    """Use these budgets from now on."""
     _Now.budgets = budgets
 
 
 def allow_as_typed(arguments: Iterable[str]) -> None:
-    """Let the defaults hold, but for what the command line says: files are read before Hydra has composed a config."""
+    """Use the defaults with the command line's overrides: files are read before Hydra has composed a config."""
     known, typed = {field.name for field in fields(Budgets)}, dict[str, int]()
     for argument in arguments:
         key, _, value = argument.lstrip("+").partition("=")
         name = key.removeprefix("budgets.")
-        if key != name and name in known:  # what is mistyped is named by Hydra
+        if key != name and name in known:  # Hydra reports mistyped names
             if not value.isdecimal():
                 raise InputError(f"{key}={value}: give a whole number above 0.")
             typed[name] = int(value)
@@ -82,7 +82,7 @@ def allow_as_typed(arguments: Iterable[str]) -> None:
 
 
 def require_within(name: str, count: int | float, where: str | Path, what: str) -> None:
-    """Refuse more of `what` than the budget `name` allows; `count` is infinite where counting stopped at the limit."""
+    """Refuse more of `what` than the budget `name` allows; `count` is infinite if counting stopped at the limit."""
     most = getattr(limits(), name)
     if count > most:
         is_known = not math.isinf(count)
@@ -93,7 +93,7 @@ def require_within(name: str, count: int | float, where: str | Path, what: str) 
 
 
 MARKS = {"json": "[{,:", "xml": "<=", "yaml": "[{,:-?\n", "text": " \t\n"}
-"""Of each kind of text, what begins or parts its elements: counted, they are an upper bound before anything is read."""
+"""For each kind of text, what begins or separates its elements: their count is an upper bound before parsing."""
 
 
 def require_text_within(kind: str, text: str, where: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Fetch one public file: checked, atomic, one process at a time."""
+"""Fetch one public file: verified, atomic, one process at a time."""
 
 import hashlib
 import http.client
@@ -21,14 +21,14 @@ log = logging.getLogger(__name__)
 
 
 def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
-    """Bring the file at `url` to `target`; do nothing if it is there already.
+    """Download the file at `url` to `target`; do nothing if it already exists.
 
-    The target appears only when its size and checksum are right.
+    The target appears only if its size and checksum are correct.
 
     Args:
-        url: an https address. Plain http is taken only with a checksum, or from this machine.
-        target: where the file shall lie; its folder is made.
-        num_bytes: its exact size, for which there is room in memory.
+        url: an HTTPS address. Plain HTTP is accepted only with a checksum, or from this machine.
+        target: destination of the file; its folder is made.
+        num_bytes: its exact size, which must fit into memory.
         sha256: its checksum in hexadecimal; None checks the size only.
     """
     try:
@@ -41,7 +41,7 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
                     part.write_bytes(content)
     except (http.client.HTTPException, OSError, ValueError) as error:
         if isinstance(error, HTTPError):
-            error.close()  # it holds the answer
+            error.close()  # it holds the response
         raise InputError(
             f"Could not download {url}: {error or type(error).__name__}. Run again to try once more, or get "
             f"the file ({num_bytes} bytes) from that address by hand and put it at {target.resolve()}."
@@ -50,7 +50,7 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
 
 def _received(url: str, num_bytes: int, sha256: str | None) -> bytes:
     parts = urlsplit(url)
-    # Nobody else's answer is believed.
+    # No other server's response is accepted.
     if parts.scheme != "https" and not (parts.scheme == "http" and (sha256 or parts.hostname in LOCAL)):
         raise ValueError(f"{url} is not an https address, which is needed without a checksum")
     with urlopen(Request(url, headers={"User-Agent": "nerf-lightning"}), timeout=TIMEOUT) as response:

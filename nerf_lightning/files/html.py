@@ -1,4 +1,4 @@
-"""Pages that hold all that they show: opened from the disk, they load nothing, and run no script but our own."""
+"""Self-contained pages: opened from disk, they load nothing, and run only our own scripts."""
 
 import base64
 import hashlib
@@ -15,11 +15,11 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_html
 
 SCENE_PAGE = b"<!-- nerf_lightning page 1 -->"
-"""How the page of a scene begins (`nerf export what=page`)."""
+"""The beginning of a scene's page (`nerf export what=page`)."""
 
 
 def rendered(template: Path, **values: Any) -> str:
-    """Return a page; every text in it is escaped, and only `Markup` is put in as it is."""
+    """Return a page; every text in it is escaped, and only `Markup` is inserted unchanged."""
     environment = Environment(
         loader=FileSystemLoader(template.parent), autoescape=True, undefined=StrictUndefined, finalize=_escaped
     )
@@ -27,17 +27,17 @@ def rendered(template: Path, **values: Any) -> str:
 
 
 def write_page(template: Path, target: Path, **values: Any) -> None:
-    """Write a page as one file, with the script and the style of its name beside the template."""
+    """Write a page as one file, with the script and the style of the same name next to the template."""
     script, style = (template.with_suffix(ending).read_text(encoding="utf-8") for ending in (".js", ".css"))
     policy = own_policy(script, style)
-    # Ours alone are put in as they are.
+    # Only ours are inserted unchanged.
     page = rendered(template, **values, policy=policy, script=Markup(script), style=Markup(style))
     with whole_file(target) as part:
         part.write_text(page, encoding="utf-8")
 
 
 def is_scene_page(path: Path) -> bool:
-    """Return whether a file begins as our page of a scene does."""
+    """Return whether a file begins like our page of a scene."""
     try:
         with open_regular(path, None) as file:
             return SCENE_PAGE in file.read(200)
@@ -46,7 +46,7 @@ def is_scene_page(path: Path) -> bool:
 
 
 def own_policy(script: str, style: str) -> str:
-    """Return the content security policy of a page with one script and one style, and pictures and films within it."""
+    """Return the content security policy of a page with one script, one style, and embedded pictures and films."""
     return (
         f"default-src 'none'; img-src data:; media-src data:; script-src '{_digest(script)}'; "
         f"style-src '{_digest(style)}'; base-uri 'none'; form-action 'none'"
@@ -54,13 +54,13 @@ def own_policy(script: str, style: str) -> str:
 
 
 def json_in_page(value: Any) -> Markup:
-    """Return a value as JSON for an element of a page: nothing of it ends the element."""
+    """Return a value as JSON for an element of a page; nothing in it closes the element."""
     text = json.dumps(value, allow_nan=False)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def data_address(kind: str, content: bytes) -> str:
-    """Return bytes as an address of this media type."""
+    """Return bytes as a data URL of a media type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 

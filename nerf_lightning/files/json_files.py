@@ -1,4 +1,4 @@
-"""Json files: parsed, with their mistakes named, and written."""
+"""Read JSON files, reporting their mistakes, and write them."""
 
 import json
 import math
@@ -16,7 +16,7 @@ CURE = "Export it again, or fix it with a JSON checker."
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a json file."""
+    """Return the content of a JSON file."""
     try:
         return parse_json(read_text(path, "json", CURE), path)
     except InputError as error:
@@ -26,7 +26,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, where: Path) -> Any:
-    """Return the content of a json text, which is `where`."""
+    """Return the content of a JSON text from `where`."""
     try:
         return json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
@@ -34,7 +34,7 @@ def parse_json(text: str, where: Path) -> Any:
         raise InputError(f"{where} is not valid json: {error.msg} at {place}. {CURE}") from error
     except RecursionError as error:
         raise InputError(f"{where} nests its brackets too deeply to be a capture. {CURE}") from error
-    except ValueError as error:  # a number of thousands of digits
+    except ValueError as error:  # a number with thousands of digits
         raise InputError(f"{where} is not usable json: {error}. {CURE}") from error
 
 
@@ -47,7 +47,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:
-    """Return the values of keys, all of which must be there; `where` and the format (`wanted_by`) are for messages."""
+    """Return the values of required keys; `where` and the format (`wanted_by`) are for messages."""
     if not isinstance(content, dict):
         raise InputError(
             f"{where} must be a json object with the keys {listed(keys)}, but it is {type(content).__name__}."
@@ -64,7 +64,7 @@ LARGEST = 1e30
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
+    """Return the content of a JSON file; empty if it is missing, damaged or not an object."""
     try:
         return mapping(read_json(path))
     except InputError:
@@ -72,19 +72,19 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def mapping(value: object) -> dict[str, Any]:
-    """Return an object from a file, an empty one where it is anything else."""
+    """Return an object from a file; an empty one if it is anything else."""
     return value if isinstance(value, dict) else {}
 
 
 def number(value: Any) -> float | None:
-    """Return a number from a file, None where it is anything else; NaN is no number."""
+    """Return a number from a file; None if it is anything else, including NaN."""
     if not isinstance(value, (int, float)) or isinstance(value, bool) or abs(value) > LARGEST or value != value:
         return None
     return float(value)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a json file, whole or not at all; NaN and infinity, for which json has no word, become null."""
+    """Write a JSON file atomically; NaN and infinity, which JSON lacks, become null."""
     with whole_file(path) as part:
         part.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 

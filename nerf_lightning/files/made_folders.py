@@ -1,9 +1,9 @@
-"""Places that are written to: named, made, emptied and removed here alone.
+"""Output folders and files: named, made, emptied and removed only here.
 
-A name may hold what anybody has chosen (a scene, a photograph, a setting), an unpacked archive can bring links, and a
-person may have a folder of the name that we give to one of ours. So a name leads nowhere, nothing is reached through a
-link below the folder that the user named (which may be a link itself: it is the user's own word), and only a folder in
-which a file says that this program made it is ever emptied.
+A name may contain untrusted text (a scene, a photograph, a setting), an unpacked archive can contain links, and the
+user may have a folder with the name of one of ours. So a name never leaves its folder, links below the folder that the
+user named are not followed (that folder may be a link itself: it is the user's choice), and only folders marked as made
+by this program are ever emptied.
 """
 
 import hashlib
@@ -22,28 +22,28 @@ from nerf_lightning.messages.escaping import is_plain, listed
 
 MARK = ".made_by_nerf_lightning"  # An empty file in each folder that may be emptied
 LOCK = "lock"
-LONGEST_NAME = 200  # In bytes; file systems take 255, and temporary names are longer
+LONGEST_NAME = 200  # In bytes; file systems allow 255, and temporary names are longer
 DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d|conin\$|conout\$) *(\..*)?", re.IGNORECASE)  # Windows' names
 CACHE_SETTING = "NERF_LIGHTNING_CACHE or scene.cache_dir"
 
 
 def file_name(value: str, ending: str = "") -> str:
-    r"""Return a value as a name that any file system takes for a file or folder in the folder that it is put into.
+    r"""Return a value as a name that is valid on any file system and stays within its folder.
 
     >>> file_name("../a\x00:b", ".png"), file_name(".."), file_name("con.txt")
     ('.._a__b.png', '_', '_con.txt')
     """
     name = "".join("_" if letter in '/\\<>:"|?*' or not is_plain(letter) else letter for letter in value)
-    if len((name + ending).encode()) > LONGEST_NAME:  # the digest keeps names apart that begin alike
+    if len((name + ending).encode()) > LONGEST_NAME:  # the digest distinguishes names with the same beginning
         digest = hashlib.sha256(value.encode(errors="surrogatepass")).hexdigest()[:8]
         name = f"{name.encode()[: LONGEST_NAME - 9 - len(ending)].decode(errors='ignore')}~{digest}"
     name = f"_{name}{ending}" if DEVICE.fullmatch(name + ending) else name + ending
-    bare = name.rstrip(". ")  # which Windows leaves out
+    bare = name.rstrip(". ")  # which Windows drops
     return name if name == bare != "" else f"{bare}_"
 
 
 def child_of(folder: Path, *names: str, ending: str = "") -> Path:
-    """Return the place in a folder that is called by a value, or by several, each within the one before.
+    """Return the path in a folder that is named by one value, or by several nested ones.
 
     Raises:
         InputError: a link leads there.
@@ -60,11 +60,11 @@ def child_of(folder: Path, *names: str, ending: str = "") -> Path:
 
 
 def make_folder(root: Path, *names: str, new: bool = False) -> Path:
-    """Make the folder that `child_of` returns, and those around it that are missing; one that exists is taken.
+    """Make the folder that `child_of` returns, and its missing parents; an existing one is used.
 
     Raises:
         InputError: a link leads there.
-        OSError: it cannot be made, or exists and is to be `new`.
+        OSError: it cannot be made, or exists although it must be `new`.
     """
     folder = child_of(root, *names)
     folder.mkdir(parents=True, exist_ok=not new)
@@ -72,10 +72,10 @@ def make_folder(root: Path, *names: str, new: bool = False) -> Path:
 
 
 def make_own_folder(folder: Path, setting: str = CACHE_SETTING) -> None:
-    """Make a folder, and those above it that are missing, for the user alone (mode 0700).
+    """Make a folder and its missing parents, accessible only to the user (mode 0700).
 
     Raises:
-        InputError: it belongs to somebody else or can be written by others; `setting` names another one.
+        InputError: it belongs to someone else or is writable by others; `setting` chooses another one.
         OSError: it cannot be made.
     """
     if not folder.parent.exists():
@@ -89,7 +89,7 @@ def make_own_folder(folder: Path, setting: str = CACHE_SETTING) -> None:
 
 
 def require_no_way_out(folder: Path) -> None:
-    """Refuse to write into a folder, or to show one, with links that lead out of it: an archive may bring them."""
+    """Refuse to write into a folder, or to show one, with links that lead out of it: an archive may contain them."""
     root = os.path.realpath(folder)
     for base, folders, names in walk(Path(root)):
         for path in (base / name for name in (*folders, *names)):
@@ -102,17 +102,17 @@ def require_no_way_out(folder: Path) -> None:
 
 
 def remove_empty(*folders: Path) -> None:
-    """Remove those of the folders that hold nothing, the innermost given first."""
+    """Remove the empty ones of the folders, given innermost first."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
 
 
 def make_ours(root: Path, *names: str, files: str = "*") -> Path:
-    """Make a folder as `make_folder` does, whose `files` (a pattern) will be removed again, and mark it as ours.
+    """Make a folder like `make_folder`, mark it as ours, and allow its `files` (a pattern) to be removed.
 
     Raises:
-        InputError: a link leads there, or it has such files and no mark.
+        InputError: a link leads there, or it contains such files without a mark.
     """
     folder = make_folder(root, *names)
     if not (folder / MARK).is_file():
@@ -127,7 +127,7 @@ def make_ours(root: Path, *names: str, files: str = "*") -> Path:
 
 
 def empty_ours(folder: Path, files: str = "*") -> None:
-    """Remove what `make_ours` was told of from the folder that it made; links in it go, and what they lead to stays."""
+    """Remove the `files` from a folder of `make_ours`; links in it are removed, and their targets stay."""
     if (folder / MARK).is_file() and not folder.is_symlink():
         for path in folder.glob(files):
             if path.is_dir() and not path.is_symlink():
@@ -137,7 +137,7 @@ def empty_ours(folder: Path, files: str = "*") -> None:
 
 
 def require_run(folder: Path) -> None:
-    """Refuse to write to the folder of a run that is gone."""
+    """Refuse to write to a run folder that no longer exists."""
     if not (folder / "run.json").is_file():
         raise InputError(
             f"The run folder {folder} was deleted, moved or renamed during the run, so the run stops here. If the "
@@ -146,12 +146,12 @@ def require_run(folder: Path) -> None:
 
 
 class ScratchFolder:
-    """A folder for what is unfinished, in an output folder; one process holds it, and removes it in the end.
+    """A folder for unfinished files in an output folder; one process holds it, and removes it at the end.
 
     Args:
         root: the output folder.
         name: of the folder in it.
-        doing: what the process that holds it does there, for the message of another one.
+        doing: what the holding process does there, for the message in another one.
     """
 
     def __init__(self, root: Path, name: str, doing: str) -> None:
@@ -159,10 +159,10 @@ class ScratchFolder:
         self.lock = FileLock(self.path / LOCK)
 
     def hold(self) -> None:
-        """Make it, and keep others out. What a process that was killed left in it stays.
+        """Make it, and lock others out. Files that a killed process left in it stay.
 
         Raises:
-            InputError: another process holds it, a link leads there, or it holds what this program has not made.
+            InputError: another process holds it, a link leads there, or it contains files not made by this program.
             OSError: it cannot be made.
         """
         make_ours(self.root, self.path.name)
@@ -176,11 +176,11 @@ class ScratchFolder:
             ) from error
 
     def release(self) -> None:
-        """Let others have it, with what is in it."""
+        """Release it to others, with its contents."""
         self.lock.release()
 
     def remove(self) -> None:
-        """Remove it, as far as that can be, while it is held: the lock's file last, since then others may come."""
+        """Remove it, as far as possible, while it is held: the lock file last, since others may then enter."""
         with suppress(OSError):
             empty_ours(self.path)
             (self.path / MARK).unlink()

@@ -1,8 +1,8 @@
-"""Files of folders that anybody may have made: opened only where they are regular files, and of a bounded size.
+"""Files of untrusted folders: opened only if they are regular files of a bounded size.
 
-An archive can carry a FIFO, which is waited for without end, and a link can lead to a device. So a file is opened
-without waiting, and checked once it is open: nobody can put another one in its place in between. Who needs a file opens
-it, and does not ask first whether it is there: what is in its place is explained here.
+An archive can contain a FIFO, which would block forever, and a link can lead to a device. So a file is opened without
+blocking, and checked once it is open: it cannot be replaced in between. Callers open a file without first checking that
+it exists: errors are explained here.
 """
 
 import codecs
@@ -17,7 +17,7 @@ from nerf_lightning.files.budgets import limits, require_text_within, require_wi
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
-# Of posix; Windows has neither FIFOs nor devices among its files.
+# POSIX only; Windows has neither FIFOs nor devices among its files.
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 KINDS = {
@@ -30,38 +30,38 @@ MOST_NAMES = 10  # Of a folder, in a message
 
 
 class UnopenedError(InputError, OSError):
-    """Report a file that the system does not open; whoever takes an OSError for its answer takes this, too."""
+    """The system does not open a file; code that handles OSError handles this, too."""
 
 
 class AbsentError(UnopenedError):
-    """Report that there is no file at a path."""
+    """There is no file at a path."""
 
 
 def open_regular(path: Path, size: str | int | None, cure: str = CURE, follow_links: bool = True) -> io.BufferedReader:
     """Open a regular file for reading.
 
     Args:
-        path: where it lies.
-        size: its kind (`ply`), whose budget limits its bytes (`budgets.ply_bytes`); a number of bytes; or None where
-            the reader itself takes no more than it has checked.
-        cure: what to do about what is no such file, for the message.
-        follow_links: open what a symbolic link leads to; where it may lead is for the caller to say.
+        path: the file.
+        size: its kind (`ply`), whose budget limits its bytes (`budgets.ply_bytes`); a number of bytes; or None if the
+            reader itself reads no more than it has checked.
+        cure: what to do if it is not such a file, for the message.
+        follow_links: open the target of a symbolic link; the caller decides where it may lead.
 
     Raises:
-        AbsentError: there is none.
+        AbsentError: it does not exist.
         UnopenedError: the system refuses to open it.
-        InputError: it is no regular file, is larger, or is a link that is not followed.
+        InputError: it is not a regular file, is larger, or is a link that is not followed.
     """
     return os.fdopen(_opened(path, os.O_RDONLY, size, cure, follow_links), "rb")
 
 
 def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
-    """Open a regular file for writing at its end, or make it; see `open_regular`. Links are not followed."""
+    """Open a regular file for appending, creating it if necessary; see `open_regular`. Links are not followed."""
     return os.fdopen(_opened(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, None, cure, follow_links=False), "ab")
 
 
 def open_own(path: Path, size: str | int | None) -> io.BufferedReader:
-    """Open a file of a folder that is the user's own (see `open_regular`); others' files are refused, and links."""
+    """Open a file in a folder of the user's own (see `open_regular`); refuse others' files and links."""
     file = open_regular(path, size, MADE_AGAIN, follow_links=False)
     try:
         require_own(path, os.fstat(file.fileno()), MADE_AGAIN)
@@ -72,7 +72,7 @@ def open_own(path: Path, size: str | int | None) -> io.BufferedReader:
 
 
 def require_own(path: Path, state: os.stat_result, cure: str) -> None:
-    """Refuse a file or folder that somebody else can have written; Windows does not tell."""
+    """Refuse a file or folder that someone else may have written; Windows cannot tell."""
     mode, reason = stat.S_IMODE(state.st_mode), None
     if os.name == "posix" and mode & (stat.S_IWGRP | stat.S_IWOTH):
         reason = f"can be written by others (mode {mode:04o})"
@@ -83,13 +83,13 @@ def require_own(path: Path, state: os.stat_result, cure: str) -> None:
 
 
 def read_bytes(path: Path, size: str | int, cure: str = CURE) -> bytes:
-    """Return the content of a regular file, as large as it was when it was opened; `size` as of `open_regular`."""
+    """Return the content of a regular file, with its size when it was opened; `size` as for `open_regular`."""
     with open_regular(path, size, cure) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, kind: str, cure: str = CURE) -> str:
-    """Return a text file of a kind (`json`) in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
+    """Return a text file of a kind (`json`) in UTF-8, or in UTF-16 with a byte order mark; line ends become \\n."""
     content = io.BytesIO(read_bytes(path, kind, cure))
     try:
         text = io.TextIOWrapper(content, encoding_of(content)).read()
@@ -101,10 +101,10 @@ def read_text(path: Path, kind: str, cure: str = CURE) -> str:
 
 
 def read_lines(file: io.BufferedReader, encoding: str, errors: str = "strict") -> Iterator[str]:
-    """Return the lines of a text one at a time, each no longer than `budgets.text_bytes`: a sparse file is one line.
+    """Yield the lines of a text, each no longer than `budgets.text_bytes`: a sparse file is one line.
 
     Raises:
-        ValueError: a longer line, or no text.
+        ValueError: a line is longer, or the file is not text.
     """
     most = limits().text_bytes
     with io.TextIOWrapper(file, encoding, errors, newline="\n") as lines:
@@ -115,14 +115,14 @@ def read_lines(file: io.BufferedReader, encoding: str, errors: str = "strict") -
 
 
 def encoding_of(file: io.BufferedIOBase) -> str:
-    """Return how the text of a file is encoded, by its byte order mark: UTF-16, which Windows writes, or UTF-8."""
+    """Return the encoding of a text file by its byte order mark: UTF-16, which Windows writes, or UTF-8."""
     start = file.read(2)
     file.seek(0)
     return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 def what_is(path: Path) -> str:
-    """Return what lies at a path, as the rest of a sentence that begins with it.
+    """Return what is at a path, as the rest of a sentence that begins with the path.
 
     >>> what_is(Path("/")), what_is(Path("/nowhere"))
     ('is a folder', 'does not exist')
@@ -137,10 +137,10 @@ def what_is(path: Path) -> str:
 
 
 def contents(folder: Path) -> str:
-    """Return what a folder holds, in a few words: names, with what they are where that is neither file nor folder."""
+    """Return a short list of a folder's contents: names, with their type if neither file nor folder."""
     try:
         names = sorted(os.listdir(folder))
-    except (OSError, ValueError) as error:  # it does not exist either
+    except (OSError, ValueError) as error:  # including a missing folder
         return f"nothing that can be read ({getattr(error, 'strerror', error)})"
     kinds = [what_is(folder / name).removeprefix("is ") for name in names[:MOST_NAMES]]
     notes = ["" if kind in ("a file", "a folder") else f" ({kind})" for kind in kinds]
@@ -151,7 +151,7 @@ def _opened(path: Path, flags: int, size: str | int | None, cure: str, follow_li
     try:
         handle = os.open(path, flags | WITHOUT_WAITING | (0 if follow_links else NO_LINK), 0o666)
     except (OSError, ValueError) as error:
-        with suppress(OSError, ValueError):  # a socket, or a pipe that nobody reads, cannot be opened
+        with suppress(OSError, ValueError):  # a socket, or a pipe without a reader, cannot be opened
             _require_regular(path, os.stat(path, follow_symlinks=follow_links), None, cure)
         if isinstance(error, PermissionError) or os.path.exists(path):
             raise UnopenedError(f"{path} cannot be opened: {getattr(error, 'strerror', error)}. {cure}") from error

@@ -1,4 +1,4 @@
-"""By what a file is known: its name, and words or bytes at its beginning."""
+"""Recognize files by their names, and by words or bytes at their beginning."""
 
 import codecs
 import re
@@ -10,9 +10,9 @@ from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
 HEAD = 1 << 16
-"""Bytes of a file in which the words are looked for."""
+"""Bytes of a file in which the words are searched for."""
 MOST_FILES = 20
-"""Of a folder whose beginnings are read for one pattern."""
+"""Maximum number of files in a folder whose beginnings are read for one pattern."""
 
 ARCHIVE, WEB_PAGE = (
     "a {} archive: unpack it, and give what it holds",
@@ -29,21 +29,21 @@ OTHERS = (
     *((4, mark, FILM) for mark in (b"ftypqt", b"ftypmp4", b"ftypiso", b"ftypM4V", b"ftyp3gp", b"moov", b"wide")),
     *((8, b"AVI ", FILM), (0, b"\x1aE\xdf\xa3", FILM)),
 )
-"""Where a file of another format has which bytes; at its beginning letters count as small ones."""
+"""Offsets and bytes that identify other formats; at the beginning, letters are compared in lowercase."""
 ZIPS = (".npz", ".npy", ".ckpt", ".pt", ".pth")
-"""Files that are archives themselves, or may be."""
+"""Files that are, or may be, archives themselves."""
 
 Signature = tuple[str, str]
 """A pattern of names below a folder, and a regular expression that the beginning of such a file contains; "" is any."""
 
 
 def file_with(folder: Path, signature: Signature) -> str | None:
-    """Return the first file, in order of names, that has a signature: its path below `folder`, with /."""
+    """Return the first file, sorted by name, that has a signature: its path below `folder`, with /."""
     return next(files_with(folder, signature), None)
 
 
 def files_with(folder: Path, signature: Signature) -> Iterator[str]:
-    """Yield the files below a folder that have a signature, in order of names."""
+    """Yield the files below a folder that have a signature, sorted by name."""
     pattern, words = signature
     if any(mark in pattern for mark in "*?["):
         paths = sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
@@ -55,13 +55,13 @@ def files_with(folder: Path, signature: Signature) -> Iterator[str]:
 
 
 def fits(path: Path, signature: Signature) -> bool:
-    """Return whether a file has the name and the words of a signature, wherever it lies."""
+    """Return whether a file has the name and the words of a signature, wherever it is."""
     pattern, words = signature
     return fnmatch(path.name, pattern.rpartition("/")[2]) and (not words or bool(re.search(words, beginning(path))))
 
 
 def other_format(path: Path) -> str | None:
-    """Return what a file is that is not what it is called, and the cure; None where its first bytes say nothing."""
+    """Return the actual format of a misnamed file, and the cure; None if its first bytes do not tell."""
     start = _start(path)
     text = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     for place, mark, words in OTHERS:
@@ -71,13 +71,13 @@ def other_format(path: Path) -> str | None:
 
 
 def beginning(path: Path) -> str:
-    """Return the beginning of a file as text, empty where it cannot be opened; what is no text becomes signs for it."""
+    """Return the beginning of a file as text, empty if it cannot be opened; invalid bytes are replaced."""
     text = _start(path).replace(b"\0", b"").decode("utf-8", "replace")
-    return text.removeprefix("\ufeff")  # UTF-16 is read, too
+    return text.removeprefix("\ufeff")  # also UTF-16's
 
 
 def _start(path: Path) -> bytes:
-    """Return the first bytes of a file; none where it cannot be opened."""
+    """Return the first bytes of a file; empty if it cannot be opened."""
     try:
         with open_regular(path, None) as file:
             return file.read(HEAD)

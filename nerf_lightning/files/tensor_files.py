@@ -1,8 +1,8 @@
-"""PyTorch's files (`torch.save`) as plain containers and tensors: one reader, so what is checked is what is loaded.
+"""PyTorch files (`torch.save`) as plain containers and tensors: one reader, so what is checked is what is loaded.
 
 Such a file is a zip archive of a pickle (`NAME/data.pkl`) and of the bytes of each storage (`NAME/data/KEY`). A machine
-that knows only the instructions and calls of weights runs the pickle, and tensors are views of the entries' bytes: no
-code of the file is executed, and its tensors take no more memory than the file.
+that knows only the instructions and calls needed for weights runs the pickle, and tensors are views of the entries'
+bytes: no code in the file is executed, and its tensors take no more memory than the file.
 """
 
 import io
@@ -30,7 +30,7 @@ INSTRUCTIONS = (
     "EMPTY_DICT SETITEM SETITEMS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL "
     "REDUCE BINPERSID"
 )
-"""Of protocol 2, which torch.save writes; BUILD, which sets attributes of state dicts, is passed over."""
+"""Instructions of protocol 2, which torch.save writes; BUILD, which sets attributes of state dicts, is skipped."""
 _Machine: Any = pickle._Unpickler  # in Python, so that instructions can be left out
 
 
@@ -38,9 +38,9 @@ def load_tensors(path: Path) -> Any:
     """Return the tensors and plain containers of a file that `torch.save` wrote, on the CPU.
 
     Raises:
-        InputError: it is no regular file, is larger than allowed, or is in PyTorch's format from before version 1.6.
-        Mismatch: it is another kind of file, or holds anything else than tensors and plain containers.
-        Exception: whatever zipfile, pickle and torch raise for a file that is damaged.
+        InputError: it is not a regular file, is larger than allowed, or is in PyTorch's format before version 1.6.
+        Mismatch: it is another kind of file, or contains anything but tensors and plain containers.
+        Exception: whatever zipfile, pickle and torch raise for a damaged file.
     """
     with open_regular(path, "tensor") as file:
         if file.read(len(LEGACY)) == LEGACY:
@@ -52,12 +52,12 @@ def load_tensors(path: Path) -> Any:
 
 
 def _entries(file: io.BufferedReader) -> dict[str, tuple[int, int, int]]:
-    """Return by name where the bytes of each entry begin, their number and their checksum.
+    """Return the offset, the number of bytes and the checksum of each entry by name.
 
-    The file is exactly one archive, whose entries are stored and do not overlap.
+    The file must be exactly one archive, whose entries are uncompressed and do not overlap.
 
     Raises:
-        Mismatch: with what is not so.
+        Mismatch: it is not; the message says why.
     """
     directory = start_of_directory(file, limits().tensor_objects)
     with zipfile.ZipFile(file) as archive:
@@ -76,7 +76,7 @@ def _entries(file: io.BufferedReader) -> dict[str, tuple[int, int, int]]:
 
 
 def _view(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object) -> Tensor:
-    """Return a tensor of a storage, as `torch._utils._rebuild_tensor_v2` does, without gradients or hooks."""
+    """Return a tensor of a storage, like `torch._utils._rebuild_tensor_v2`, without gradients or hooks."""
     tensor = storage.as_strided(size, stride, offset)
     if tensor.numel() > len(storage):
         raise Mismatch("it", f"holds a tensor of the shape {tuple(size)} that repeats few numbers, to fill memory")
@@ -92,7 +92,7 @@ GLOBALS: dict[str, Any] = {
     **{"torch.ShortStorage": torch.int16, "torch.CharStorage": torch.int8, "torch.ByteStorage": torch.uint8},
     "torch.BoolStorage": torch.bool,
 }
-"""What the files of this program, and state dicts, call; a storage is read as numbers of its dtype."""
+"""Globals used by this program's files and state dicts; a storage is read as numbers of its dtype."""
 
 
 class _Unpickler(_Machine):
@@ -114,7 +114,7 @@ class _Unpickler(_Machine):
         super().__init__(io.BytesIO(self._content("data.pkl").tobytes()))
 
     def _content(self, name: str) -> Any:
-        """Return the bytes of an entry, in memory of their own: a mapped file can change after it was checked."""
+        """Return a copy of an entry's bytes: a mapped file can change after it was checked."""
         start, size, checksum = self.entries[f"{self.root}{name}"]
         content: Any = np.empty(size, np.uint8)
         self.file.seek(start)
@@ -123,7 +123,7 @@ class _Unpickler(_Machine):
         return content
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what a global of the pickle stands for."""
+        """Return the object that a global of the pickle stands for."""
         path = f"{module}.{name}"
         if path not in GLOBALS:
             raise Mismatch("it", f"holds more than plain values ({path[:100]!a}), and nothing from a file is executed")

@@ -1,8 +1,8 @@
-"""The one rule for files that anybody may have made: nothing in them runs, and all has the type that it must have.
+"""The one rule for untrusted files: nothing in them runs, and everything has the required type.
 
-Weights and optimizer state fit a template, which is what this config builds; all else fits its annotations. Integers
-that index or size memory are checked against their range, where they are used. Numbers are not judged one by one: a
-file may hold a wrong scene, but no harm.
+Weights and optimizer state match a template, which this config builds; all else matches its annotations. Integers that
+index or size memory are checked against their range where they are used. Numbers are not judged individually: a file
+may contain a wrong scene, but nothing harmful.
 """
 
 import math
@@ -21,12 +21,12 @@ from torch import Tensor
 from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError
 
-LARGEST_COUNT = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
+LARGEST_COUNT = 1 << 53  # Integers beyond are not counts: doubles cannot distinguish them
 CURE = "It is damaged, or was made by somebody else: use another one."
 
 
 class Mismatch(ValueError):
-    """Report the first value that is not what it must be: where it is, and what is wrong with it."""
+    """The first invalid value: where it is, and what is wrong with it."""
 
     def __str__(self) -> str:
         return " ".join(self.args)
@@ -34,7 +34,7 @@ class Mismatch(ValueError):
 
 @contextmanager
 def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
-    """Turn whatever a broken file raises while it is read into one paragraph that names the file."""
+    """Turn any exception raised while reading a broken file into one paragraph that names the file."""
     try:
         yield
     except InputError:
@@ -49,18 +49,18 @@ def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
 
 
 def require_fit(value: object, kind: Any, place: str, optional: Mapping[str, Any] | None = None) -> None:
-    """Refuse what does not fit an annotation or a template.
+    """Refuse a value that does not match an annotation or a template.
 
     Args:
-        value: as it was read; nothing is known of it.
+        value: as read; nothing is known about it.
         kind: an annotation of plain values, containers and tensors with shapes (`object` is anything), or a template of
             them: dictionaries and lists of kinds, tensors, which may be on `meta`, and plain values, of which only the
-            type counts. A dataclass stands for a dictionary of its fields.
+            type counts. A dataclass represents a dictionary of its fields.
         place: the keys from the file's top, for messages.
-        optional: keys that a dictionary may also have; of a dataclass they are those with a default.
+        optional: keys that a dictionary may also have; for a dataclass, those with a default.
 
     Raises:
-        Mismatch: other keys, lengths, types, shapes or dtypes, a whole number beyond 0 to 2^53, NaN or infinity.
+        Mismatch: other keys, lengths, types, shapes or dtypes, an integer outside 0 to 2^53, NaN or infinity.
     """
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
@@ -81,7 +81,7 @@ def require_fit(value: object, kind: Any, place: str, optional: Mapping[str, Any
 
 
 def _entries(value: Any, kind: Any, place: str, optional: Mapping[str, Any]) -> Iterator[tuple[Any, Any, str]]:
-    """Yield what a container holds, with its kind and its place; the container itself is checked first."""
+    """Check a container, and yield its elements with their kinds and places."""
     origin, parts = get_origin(kind), get_args(kind)
     if (origin or type(kind)) in (list, tuple):
         _require_type(value, origin or type(kind), place)
@@ -112,7 +112,7 @@ def _require_tensor(value: Any, kind: Any, place: str) -> None:
         fits, ours = (value.shape, value.dtype) == (kind.shape, kind.dtype), f"{kind.dtype} in {tuple(kind.shape)}"
     elif kind is Tensor:
         fits, ours = True, ""
-    else:  # of floating-point numbers float32, if no other type is annotated
+    else:  # floating-point numbers are float32 unless another type is annotated
         exact = value.dtype in (torch.float32, torch.int64, torch.uint8) or kind.dtypes == ("float64",)
         fits, ours = exact and isinstance(value, kind), f"{kind.__name__.partition('[')[0]} in ({kind.dim_str})"
     if not fits:
@@ -141,7 +141,7 @@ def _below(place: str, key: object) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as a message shows it: in full where it is short and plain, else what kind of thing it is.
+    """Return a value for a message: in full if it is short and plain, else its kind.
 
     >>> shown("a"), shown(3), shown({"a": 1}), shown(10**200), shown(10**5000)
     ("'a'", '3', 'a dict', 'a number of 201 digits', 'a number of 5001 digits')

@@ -1,4 +1,4 @@
-"""Folders below a folder, however deep: Python's own `os.walk` (up to 3.11) and `rglob` go down by recursion."""
+"""Walk folders of any depth: Python's own `os.walk` (up to 3.11) and `rglob` recurse."""
 
 import os
 from collections.abc import Iterator
@@ -8,9 +8,9 @@ from pathlib import Path
 def walk(root: Path, through_links: bool = False) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Yield each folder, the folders in it and the other names in it, the folder itself first, as `os.walk` does.
 
-    Links to folders are named, and followed only `through_links`, each folder once, so that a loop of links ends;
-    folders that cannot be read are passed over. What the caller takes out of the list of folders is not entered, and
-    their order is the caller's.
+    Links to folders are listed, and followed only `through_links`, each folder once, so that a loop of links ends;
+    unreadable folders are skipped. Folders that the caller removes from the list are not entered, and the caller may
+    reorder it.
     """
     waiting, entered = [root], set[str]()
     while waiting:

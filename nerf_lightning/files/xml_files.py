@@ -1,4 +1,4 @@
-"""XML files: plain elements, without entities, a few lines of which are billions of characters once expanded."""
+"""XML files: plain elements, without entities, a few lines of which can expand to billions of characters."""
 
 from pathlib import Path
 from xml.etree import ElementTree

@@ -1,7 +1,7 @@
-"""Yaml from strangers: plain values, without references, of bounded size.
+"""Untrusted YAML: plain values of bounded size, without references.
 
-`yaml.safe_load` makes no objects, but twelve lines of anchors and aliases become a billion entries as soon as somebody
-walks through them, and merge keys (`<<`) do so while the file is read. No file that this program writes has any.
+`yaml.safe_load` makes no objects, but twelve lines of anchors and aliases become a billion entries when they are
+traversed, and merge keys (`<<`) do so while the file is read. Files that this program writes have neither.
 """
 
 import json
@@ -15,7 +15,7 @@ from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 
 MOST_DEPTH, MOST_BITS = 50, 1000
-"""Brackets within brackets; bits of a whole number: larger ones are no floating-point numbers."""
+"""Maximum nesting of brackets; maximum bits of an integer: larger ones do not fit into a float."""
 CURE = "It is damaged, or was made by somebody else: use another run folder or checkpoint."
 
 
@@ -44,18 +44,18 @@ _PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_yam
 
 
 def plain_yaml(text: str, where: str | Path, cure: str = CURE) -> Any:
-    """Return what a yaml text from anybody holds; `where` it stands, and the cure of a bad one, are for the message."""
+    """Return the content of an untrusted YAML text; `where` it is, and the cure of a bad one, are for the message."""
     require_text_within("yaml", text, where)
     try:
         content = yaml.load(text, Loader=_PlainLoader)
-        json.dumps(content, sort_keys=True)  # refuses what json has not: dates, bytes, sets, keys of several kinds
+        json.dumps(content, sort_keys=True)  # refuses what JSON lacks: dates, bytes, sets, keys of mixed types
         return content
     except yaml.YAMLError as error:
         raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {cure}") from error
-    except Exception as error:  # a date of the 99th month, a number of no digits: PyYAML lets many kinds through
+    except Exception as error:  # a date in the 99th month, a number without digits: PyYAML raises many kinds
         raise InputError(f"{where} holds a value that cannot be read ({type(error).__name__}). {cure}") from error
 
 
 def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
-    """Return what a yaml file holds."""
+    """Return the content of a YAML file."""
     return plain_yaml(read_text(path, "yaml", cure), path, cure)

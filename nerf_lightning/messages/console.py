@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: lines on stdout, progress bars on stderr."""
+"""Terminal output: lines on stdout, progress bars on stderr."""
 
 import json
 import logging
@@ -15,30 +15,30 @@ from nerf_lightning.messages.escaping import for_terminal
 
 DAY = 86_400
 LINE_SECONDS = 30.0
-"""Time between two lines that say how far something is, where no bar can be shown."""
+"""Time between two lines of progress if no bar can be shown."""
 FORESEEN_FROM = 0.05
-"""The part that is done when they, and the bar of a training, begin to say how long is left: kernels are compiled at
-the start, so it says little of the rest."""
+"""Fraction done from which on they, and the bar of a training, show the remaining time: kernels are compiled at the
+start, which therefore says little about the rest."""
 
 Item = TypeVar("Item")
 log = logging.getLogger(__name__)
 
 
 def _speaks() -> bool:
-    """Return whether this process speaks for all of its run (`compute.ranks`, without importing torch)."""
+    """Return whether this process reports for all processes of its run (`compute.ranks`, without importing torch)."""
     distributed = sys.modules.get("torch.distributed")
     return distributed is None or not distributed.is_initialized() or distributed.get_rank() == 0
 
 
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
-    """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
+    """Return a bar that disappears when done; it is silent if stderr is not a terminal."""
     console = Console(stderr=True)
     shown = shown and console.is_terminal and _speaks()
     return Progress(*columns, console=console, transient=True, disable=not shown)
 
 
 class ProgressLines:
-    """A line in the log now and then that says how far something is: what a bar shows where there is a terminal."""
+    """Log progress from time to time instead of a bar if there is no terminal."""
 
     def __init__(self) -> None:
         console = Console(stderr=True)
@@ -46,7 +46,7 @@ class ProgressLines:
         self.began = self.told = time.monotonic()
 
     def __call__(self, what: str, fraction: float) -> None:
-        """Say it, if it is time; `fraction` is of the whole."""
+        """Log progress if it is time; `fraction` is of the whole."""
         now = time.monotonic()
         if not self.shown or now - self.told < LINE_SECONDS or not 0 < fraction < 1:
             return
@@ -56,7 +56,7 @@ class ProgressLines:
 
 
 def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
-    """Yield the items, and show how far it is: a bar on a terminal, elsewhere a line now and then."""
+    """Yield the items and show progress: a bar on a terminal, elsewhere a line from time to time."""
     lines = ProgressLines()
     for done, item in enumerate(track(items, description=what, transient=True, console=stderr_console())):
         lines(what, done / len(items))
@@ -64,9 +64,9 @@ def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
 
 
 class StageProgress:
-    """One bar over stages of unequal cost, with the time left; one stage at a time goes from 0 to 1.
+    """One bar over stages of unequal cost, with the remaining time; one stage at a time goes from 0 to 1.
 
-    Where there is no terminal, a line now and then says the same. `costs` are in any one unit, in the stages' order.
+    Without a terminal, lines replace the bar from time to time. `costs` are in any one unit, in the stages' order.
     """
 
     def __init__(self, costs: Mapping[str, float]):
@@ -83,7 +83,7 @@ class StageProgress:
         self.bar.stop()
 
     def __call__(self, stage: str, fraction: float) -> None:
-        """Say that `stage` is done to this fraction, and all before it wholly."""
+        """Set the progress of `stage` to this fraction, and complete all stages before it."""
         names = list(self.costs)
         before = sum(self.costs[name] for name in names[: names.index(stage)])
         completed = before + min(fraction, 1.0) * self.costs[stage]
@@ -92,7 +92,7 @@ class StageProgress:
 
 
 def spoken(seconds: int | float) -> str:
-    """Return a time as people say it.
+    """Return a duration in words.
 
     >>> [spoken(seconds) for seconds in (7.4, 260, 3600, 3900, 187_200, 3_265_128)]
     ['7 s', '4 min 20 s', '1 h', '1 h 5 min', '2 days 4 h', '38 days']
@@ -110,7 +110,7 @@ def spoken(seconds: int | float) -> str:
 
 
 class _Label(logging.Filter):
-    """What stands before each line of this process; empty: nothing."""
+    """The prefix of each line of this process; empty: none."""
 
     text = ""
 
@@ -124,14 +124,14 @@ _LABEL = _Label()
 
 
 def label_lines(label: str) -> None:
-    """Put a label before all that this process says and logs: one of several that share a terminal."""
+    """Prefix all lines that this process prints and logs: it is one of several that share a terminal."""
     _LABEL.text = f"{for_terminal(label)} " if label else ""
     for handler in logging.getLogger().handlers:
         handler.addFilter(_LABEL)
 
 
 def say(*lines: str) -> None:
-    """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
+    """Print lines to stdout; whatever they contain, each stays one line without control characters."""
     if lines:
         print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
 
@@ -142,20 +142,20 @@ def say_json(value: object) -> None:
 
 
 def say_written(*paths: Path) -> None:
-    """Print where files are, a line each, as all commands do."""
+    """Print the paths of files, a line each, as all commands do."""
     say(*(f"{'written':<12} {path}" for path in paths))
 
 
 class StdoutConsole(Console):
-    """A console on stdout. Where that is a closed pipe, rich would exit with 1; cli.process.ends_quietly decides."""
+    """A console on stdout. If that is a closed pipe, rich would exit with 1; cli.process.ends_quietly decides."""
 
     def on_broken_pipe(self) -> None:
-        """Pass on the error that is being handled."""
+        """Reraise the current error."""
         raise
 
 
 def stderr_console() -> Console:
-    """Return a console on stderr, silent where that is not a terminal, and in all processes of a run but the first."""
+    """Return a console on stderr, silent if that is not a terminal, and in all processes of a run but the first."""
     console = Console(stderr=True)
     console.quiet = not (console.is_terminal and _speaks())
     return console

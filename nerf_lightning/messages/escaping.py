@@ -1,7 +1,7 @@
-"""Text that leaves the program: names from files stay text in a terminal, a page, a table, and another program's file.
+"""Escape output: names from files stay text in a terminal, a page, a table, and another program's file.
 
-A name of a photograph, a model or a run may come from anybody, and may hold escape sequences, markup or formulas. What
-it holds is shown, as Python would write it, and never acted on.
+Names of photographs, models or runs are untrusted, and may contain escape sequences, markup or formulas. These are
+shown, as Python would write them, and never interpreted.
 """
 
 import html
@@ -14,24 +14,23 @@ from typing import Any
 
 from nerf_lightning.messages.errors import InputError
 
-FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # the wide ones count in some languages
-"""What a spreadsheet takes for the beginning of a formula."""
+FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # the full-width ones count in some languages
+"""Characters that begin a formula in spreadsheets."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 MARKUP = re.compile(r"[\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])|^[#+=-]|^\d{1,9}[.)](?=\s|$)")
-"""What Markdown takes for markup, the latter ones at the beginning of a text alone."""
+"""Matches Markdown markup, the latter alternatives only at the beginning of a text."""
 ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
 UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
+"""Unicode categories of control characters, lone surrogates (bytes that are not UTF-8), and line separators."""
 JOINERS = "\u200c\u200d"
-NARROWEST = 60  # Columns that text is wrapped to
+NARROWEST = 60  # Minimum number of columns to which text is wrapped
 MOST_CHARACTERS = 1024  # Of the name of a photograph or of a scene
 
 
 def for_terminal(text: str, most: int | None = None) -> str:
-    r"""Return a text in one line that steers no terminal, cut after `most` characters.
+    r"""Return a text in one line without terminal control, truncated after `most` characters.
 
-    Control characters, ends of lines, marks that reverse the direction of writing, and lone surrogates are written as
-    in Python.
+    Control characters, line ends, bidirectional marks, and lone surrogates are escaped as in Python.
 
     >>> for_terminal("a\x1b[2Jb\nc"), for_terminal("abc", 2)
     ('a\\x1b[2Jb\\nc', 'ab…')
@@ -41,7 +40,7 @@ def for_terminal(text: str, most: int | None = None) -> str:
 
 
 def for_html(text: str) -> str:
-    r"""Return a text as HTML shows it, within an element or an attribute in quotes; ends of lines stay.
+    r"""Return a text escaped for HTML, within an element or a quoted attribute; line ends stay.
 
     >>> for_html("<a href='x'>\x00")
     '&lt;a href=&#x27;x&#x27;&gt;\\x00'
@@ -50,20 +49,20 @@ def for_html(text: str) -> str:
 
 
 def for_markdown(text: str) -> str:
-    r"""Return a text as Markdown shows it in a paragraph or a cell of a table: no markup, HTML, link, picture or code.
+    r"""Return a text escaped for a paragraph or table cell of Markdown: no markup, HTML, link, picture or code.
 
     >>> for_markdown("fast_proposal *a* [b](c) | <d>")
     'fast_proposal \\*a\\* \\[b\\](c) \\| &lt;d&gt;'
     """
     text = html.escape(for_terminal(text).strip(), quote=False)
-    # Of an underscore between letters, of which there are many in our names, nothing is made.
+    # An underscore between letters, of which our names have many, is not markup.
     text = MARKUP.sub(lambda found: f"{found[0][:-1]}\\{found[0][-1]}", text)
-    # Addresses are made links without any markup.
+    # URLs become links without any markup.
     return ADDRESS.sub(lambda found: f"&#{ord(found[0])};", text)
 
 
 def as_code(text: str) -> str:
-    """Return a text as a code span of Markdown, where nothing is markup, HTML, a link, or, in MDX, a program.
+    """Return a text as a code span of Markdown, in which nothing is markup, HTML, a link, or, in MDX, code to run.
 
     >>> as_code("<b>`x`</b>")
     '`` <b>`x`</b> ``'
@@ -73,7 +72,7 @@ def as_code(text: str) -> str:
 
 
 def for_csv(value: Any) -> Any:
-    r"""Return a value as a cell of a CSV file: a text that a spreadsheet would take for a formula is quoted.
+    r"""Return a value as a cell of a CSV file: a text that spreadsheets would read as a formula is quoted.
 
     >>> [for_csv(value) for value in ("=1+1", "-1.5", "-a", 2.0)]
     ["'=1+1", '-1.5', "'-a", 2.0]
@@ -85,17 +84,17 @@ def for_csv(value: Any) -> Any:
 
 
 def terminal_width(otherwise: int) -> int:
-    """Return how many columns text is wrapped to: the terminal's; where there is none, as many as are given."""
+    """Return the number of columns to which text is wrapped: the terminal's, or `otherwise` without one."""
     return max(shutil.get_terminal_size((otherwise, 24)).columns, NARROWEST)
 
 
 def is_plain(name: str) -> bool:
-    """Return whether a name is UTF-8 and holds no control characters."""
+    """Return whether a name is UTF-8 without control characters."""
     return name.isprintable() or not any(unicodedata.category(letter) in UNPRINTABLE for letter in name)
 
 
 def require_printable(name: str, where: str) -> None:
-    """Refuse a name that is too long, not UTF-8 or holds control characters: `where` would be called by it."""
+    """Refuse a name for `where` that is too long, not UTF-8, or contains control characters."""
     if len(name) > MOST_CHARACTERS or not is_plain(name):
         raise InputError(
             f"{where} has the name '{for_terminal(name[:200])}', which holds control characters, is not UTF-8 or has "
@@ -104,7 +103,7 @@ def require_printable(name: str, where: str) -> None:
 
 
 class EscapingFormatter(logging.Formatter):
-    """Format log records so that whatever their messages name stays text; only tracebacks take several lines."""
+    """Format log records so that whatever their messages contain stays text; only tracebacks take several lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """Return the line of a record; Hydra indents its own with a tab."""
@@ -118,7 +117,7 @@ class EscapingFormatter(logging.Formatter):
 
 
 def _visible(letter: str) -> str:
-    # Blanks of other widths, and what joins letters in Persian, in Indian languages and in emojis, do no harm.
+    # Spaces of other widths, and joiners in Persian, in Indian languages and in emojis, are harmless.
     is_harmless = letter.isprintable() or letter in JOINERS or unicodedata.category(letter) == "Zs"
     return letter if is_harmless else letter.encode("unicode_escape").decode("ascii")
 

@@ -1,4 +1,4 @@
-"""A run built from Python, for Lightning's own Trainer, or to be trained step by step without one."""
+"""Build a run from Python, for Lightning's own Trainer, or for training step by step without one."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ OF_LIGHTNINGS_TRAINER = {
     "paths": "Trainer(default_root_dir=...)",
     "resume": "Trainer.fit(..., ckpt_path=...), or build_run(..., resume=...)",
 }
-"""Settings of `nerf train` that are given elsewhere here."""
+"""Settings of `nerf train` that are specified elsewhere here."""
 
 
 @dataclass
@@ -53,22 +53,22 @@ class StepwiseRun(Run):
     collapse_guard: CollapseGuard
     nan_guard: NanGuard
     num_steps: int = 0
-    """Steps taken by `steps`, those before a restart and before `resume` included."""
+    """Number of steps taken by `steps`, including those before a restart and before `resume`."""
     _optimizer: Optimizer | None = None
 
     def steps(self, until: int) -> Iterator[dict[str, float]]:
-        """Train until so many steps have been taken in all, which is the length that the learning rate follows.
+        """Train until `until` steps have been taken in total, which is the length that the learning rate follows.
 
-        Between two steps the run can be saved, rendered and left; `steps` goes on where it was.
+        Between two steps the run can be saved, rendered and left; `steps` continues where it stopped.
 
         Args:
-            until: the step after which the run ends, as `Trainer(max_steps=...)`.
+            until: the step after which the run ends, like `Trainer(max_steps=...)`.
 
         Yields:
-            After each step its number (`step`), `loss`, `psnr` (dB, of its rays) and `num_rays`.
+            After each step, its number (`step`), `loss`, `psnr` (dB, of its rays) and `num_rays`.
 
         Raises:
-            InputError: nothing is learned any more (NanGuard), or Lightning's Trainer has trained this run.
+            InputError: the run no longer learns (NanGuard), or Lightning's Trainer has trained it.
         """
         train_step, batches, optimizer = self.system.train_step, self.data.batches, self.optimizer
         train_step.num_steps = until
@@ -91,7 +91,7 @@ class StepwiseRun(Run):
         """The optimizer of `steps`.
 
         Raises:
-            InputError: Lightning's Trainer has trained this run, with an optimizer of its own.
+            InputError: Lightning's Trainer has trained this run with its own optimizer.
         """
         if self._optimizer is None:
             if self.system.train_step.progress.rays_seen:
@@ -105,7 +105,7 @@ class StepwiseRun(Run):
 
     @property
     def model(self) -> TrainedModel:
-        """The model as it is now; it shares its weights with the run."""
+        """The current model; it shares its weights with the run."""
         tile_points = self.settings.inference_tile_points
         return TrainedModel(self.system.model.eval(), checkpoint_of(self._content(), Path("the run")), tile_points)
 
@@ -113,7 +113,7 @@ class StepwiseRun(Run):
         """Write a checkpoint: for `build_run(..., resume=path)`, `Trainer.fit`, `nl.load` and the commands.
 
         Args:
-            path: the file; it is whole at every moment.
+            path: the file, which is written atomically.
 
         Raises:
             InputError: the weights are not finite, Lightning's Trainer has trained this run, or the file cannot be
@@ -132,7 +132,7 @@ class StepwiseRun(Run):
         write_checkpoint(self._content() | training, Path(path))
 
     def restore(self, path: str | os.PathLike[str]) -> None:
-        """Go on from a checkpoint of this run; see `build_run`."""
+        """Resume from a checkpoint of this run; see `build_run`."""
         train_step, guard, file = self.system.train_step, self.collapse_guard, Path(path)
         content = content_to_resume(file)
         state, kept = content[KEY], content.get("callbacks", {})
@@ -143,7 +143,7 @@ class StepwiseRun(Run):
             weights=self.system.state_dict(),
             optimizer=self.optimizer,
             build=train_step.build_optimizer,
-            callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without
+            callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without one
             loops=loops_after(0),
             progress=train_step.progress,
             together=train_step.objective.together,
@@ -206,7 +206,7 @@ def build_run(
 
 
 def of_scene(scene: Scene | None, overrides: Sequence[str]) -> tuple[str, ...]:
-    """Return overrides for a run whose scene was given, if one was."""
+    """Return overrides for a run whose scene was given from Python, if any."""
     if scene is None:
         return tuple(overrides)
     for override in overrides:

@@ -49,7 +49,7 @@ class TrainedModel:
 
         Args:
             camera: one camera in the user's own frame (of `Cameras.from_opencv`, `scene.user_cameras[3]` of any reading
-                of the capture, `model.path("orbit")[0]`), or the number or the name of a view of `model.scene`.
+                of the capture, `model.path("orbit")[0]`), or the index or the name of a view of `model.scene`.
             background: what lies behind the scene: white, black or none; None: as in training.
 
         Returns:
@@ -91,7 +91,7 @@ class TrainedModel:
             return replace(self.scene, cameras=cameras).user_cameras
 
     def of_scene(self, scene: Scene) -> "TrainedModel":
-        """Return the same network for another scene, from whose photographs it then renders.
+        """Return the same network for another scene; it then renders from that scene's photographs.
 
         For models of many scenes. If several captures were joined, the first one that was held out is used.
 
@@ -107,18 +107,18 @@ class TrainedModel:
     def export(self, what: str, folder: str | os.PathLike[str] | None = None, **settings: Any) -> list[Path]:
         """Write files for other programs, as `nerf export` does: `model.export("splats", format="spz")`.
 
-        The checkpoint is read again, in float32, and so are the photographs of its run where the exporter needs them.
+        The checkpoint is read again in float32, and so are the photographs of its run if the exporter needs them.
 
         Args:
-            what: the exporter, of `conf/what/`: mesh, points, splats, page, ...
-            folder: where to; None: the folder `export` of the run.
+            what: the exporter in `conf/what/`: mesh, points, splats, page, ...
+            folder: destination; None: the folder `export` of the run.
             **settings: of the exporter, as `nerf help export what=mesh` lists them.
 
         Returns:
             The files.
 
         Raises:
-            InputError: an unknown exporter or setting, or a model in which there is nothing to export.
+            InputError: unknown exporter or setting, or the model contains nothing to export.
         """
         if self.module.needs_photographs:
             raise InputError("This model renders from photographs: give those to nerf export with scene=....")

@@ -1,4 +1,4 @@
-"""A training from Python: what `nerf train` does, and what it leaves."""
+"""Train from Python like `nerf train`, and access the results."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ class TrainedRun:
 
 
 def train(*overrides: str, scene: Scene | None = None) -> TrainedRun:
-    """Train as `nerf train` does, in this process, and return the run.
+    """Train like `nerf train` in this process, and return the run.
 
     `nl.train("scene=blender", "scene.root=data/lego", "model=fast", "trainer.max_steps=800")` takes the overrides of
     the command line, including `resume=auto` and `paths.output_dir=DIR`. Ctrl-C, or the notebook's stop button, ends

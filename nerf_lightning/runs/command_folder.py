@@ -1,4 +1,4 @@
-"""Where a command that does not train writes: as the user says, or beside the checkpoint."""
+"""Output folders of commands that do not train: the user's choice, or next to the checkpoint."""
 
 import tempfile
 from collections.abc import Iterator
@@ -12,31 +12,31 @@ from nerf_lightning.runs.run_folder import job_folder
 
 
 def beside_checkpoint(checkpoint: Path, name: str) -> Path:
-    """Return the folder of this name in the run folder that a checkpoint lies in."""
+    """Return the folder of this name in a checkpoint's run folder."""
     beside = checkpoint.absolute().parent
     return (beside.parent if beside.name == "checkpoints" else beside) / name
 
 
 def chosen_folder(given: str | None, default: Path) -> Path:
-    """Return where a command that does not train is to write: as given, else by default. Nothing is made yet.
+    """Return the output folder of a command that does not train: as given, or the default. Nothing is made yet.
 
     The jobs of a sweep have folders of their own.
 
     Raises:
-        InputError: links lead out of it.
+        InputError: it contains links that lead out of it.
     """
     if given is None:
-        # Beside a checkpoint that may come from anybody.
+        # Next to an untrusted checkpoint.
         require_no_way_out(default.parent if default.is_symlink() else default)
     return job_folder() or Path(given or default)
 
 
 def output_folder(given: str | None, default: Path) -> Path:
-    """Return the folder that `chosen_folder` names, made and tried."""
+    """Make the folder that `chosen_folder` returns, check that it is writable, and return it."""
     folder = chosen_folder(given, default)
     try:
         make_folder(folder)
-        # Under a name that nobody can have planted a link at.
+        # With an unpredictable name, so that no link can have been planted there.
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".probe"):
             pass
     except OSError as error:
@@ -48,7 +48,7 @@ def output_folder(given: str | None, default: Path) -> Path:
 
 @contextmanager
 def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
-    """Lend the folder that `output_folder` returns; what was made of it and is empty at the end is removed again."""
+    """Yield the folder that `output_folder` returns; remove newly made folders that are empty at the end."""
     wanted = chosen_folder(given, default).absolute()
     made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
     try:

@@ -1,4 +1,4 @@
-"""Which runs are the same run: the settings that decide, and short names of them."""
+"""Identity of runs: the settings that define it, and their fingerprints."""
 
 import copy
 from typing import Any
@@ -10,12 +10,12 @@ from nerf_lightning.config.setting_rules import fingerprint, meaning_of
 
 
 def run_identity(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
+    """Return the settings that define a run: two with the same identity and length compute the same."""
     return {key: value for key, value in flatten(config).items() if meaning_of(key).identity}
 
 
 def settings_digest(config: DictConfig) -> str:
-    """Return a short name of everything that a run does, its length and its evaluation included."""
+    """Return a fingerprint of everything that a run does, including its length and its evaluation."""
     resolved = copy.deepcopy(config)
     OmegaConf.resolve(resolved)
     return fingerprint({key: value for key, value in flatten(resolved).items() if meaning_of(key).outcome})

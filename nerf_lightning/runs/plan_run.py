@@ -35,14 +35,14 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Run:
-    """What learns, and from what."""
+    """What is trained, and on what."""
 
     config: DictConfig
-    """Nothing in it is left open."""
+    """The complete config: nothing is left open."""
     settings: TrainerSettings
     scene: Scene
     checks: list[Check] | None
-    """What the doctor says of the scene; None: `doctor=false`."""
+    """The doctor's findings about the scene; None: `doctor=false`."""
     data: RayDataModule
     system: RadianceFieldSystem
 
@@ -60,17 +60,17 @@ def plan_run(
     """Read the scene, choose what the config leaves open, examine the capture, and build; nothing is written.
 
     Args:
-        config: as it was composed.
+        config: as composed.
         choices: the names picked from each group, which checkpoints keep.
-        overrides: what the config was composed with.
+        overrides: those of the config.
         settings: of the machine.
-        scene: one in the place of the config's.
+        scene: replaces the config's.
         former: the config of the run to resume, whose choices are kept; None: the run is new.
-        model: one in the place of the config's.
-        loss: the same.
+        model: replaces the config's.
+        loss: replaces the config's.
 
     Raises:
-        InputError: anything in the config or in the capture that makes no run.
+        InputError: the config or the capture does not allow a run.
     """
     on_gpu = settings.device_type == "cuda"
     config, scene = read_scene(config, choices, overrides, on_gpu, scene, former)
@@ -90,7 +90,7 @@ def read_scene(
     scene: Scene | None = None,
     former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, Scene]:
-    """Return the config with the size of the photographs, and the scene, with distances where the loss needs them."""
+    """Return the config with the size of the photographs, and the scene, with distances if the loss needs them."""
     config = with_longest(config, overrides, on_gpu, former)
     scene = build(config.scene).read() if scene is None else scene
     return config, with_distances(scene) if takes_distances(choices, overrides, scene) else scene
@@ -117,7 +117,7 @@ def _built(
     loss = train_step.objective.loss
     if loss.depth_every:
         record["depths"] = depth_sums(scene)
-    train_step.new_optimizer()  # what it refuses is refused before a folder is taken
+    train_step.new_optimizer()  # its errors occur before a folder is taken
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=loss.patch, depth_every=loss.depth_every
     )

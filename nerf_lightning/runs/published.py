@@ -1,4 +1,4 @@
-"""Numbers that others have published for well-known scenes, with their sources."""
+"""Published results for well-known scenes, with their sources."""
 
 import re
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ class Published:
     method: str
     psnr: float
     resolution: str
-    """Of the pictures that it was measured on."""
+    """Resolution of the test pictures."""
     steps: int | None
     time: str | None
     source: str
     measured: str
-    """On which views, of what size, over what."""
+    """How it was measured: views, size, background."""
     readers: tuple[str, ...]
-    """The formats that such a capture is read by."""
+    """The formats of such a capture."""
 
 
 def published_for(scene: str, reader: str) -> list[Published]:
-    """Return what is known of a scene (its name, or one that begins with it), the best first.
+    """Return the results for a scene (its name, or a name that begins with it), the best first.
 
     >>> [found.psnr for found in published_for("lego_200", "blender")][-1]
     31.37
     >>> published_for("bricks", "bricks")
     []
 
-    A chair of one's own is none of the benchmark's: the format that it was read by must be the same.
+    The user's own chair is not the benchmark's: the format must match.
     """
     names = {scene.lower(), re.split(r"[\W_]", scene.lower())[0]}
     found = [result for result in _all() if result.scene in names and reader in result.readers]

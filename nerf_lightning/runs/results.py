@@ -1,4 +1,4 @@
-"""Results as they lie in run folders: what was reached, by which model, on which scene, and how it was measured."""
+"""Results in run folders: metrics, model, scene, and how they were measured."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -32,33 +32,33 @@ class RunResult:
     model: str
     seed: int | None
     values: dict[str, float | None]
-    """The mean of each metric, and what else was measured; None where it is not known."""
+    """The mean of each metric, and what else was measured; None if unknown."""
     settings: dict[str, str]
-    """What else was given on the command line."""
+    """Other overrides from the command line."""
     protocol: dict[str, Any]
     origin: dict[str, Any]
 
     @property
     def folder(self) -> Path:
-        """Where the run lies."""
+        """The run folder."""
         return self.summary.folder
 
 
 @dataclass(frozen=True)
 class FoundResults:
-    """What lies in some folders."""
+    """The results in some folders."""
 
     file: str
-    """Of each run: where its numbers stand."""
+    """Name of the file with each run's numbers."""
     measured: list[RunResult]
     unmeasured: list[Path]
-    """Runs without a PSNR there."""
+    """Runs without a PSNR in it."""
 
 
 def find_results(
     folders: Sequence[Path], measured: Measured, scenes: Sequence[str] | None, models: Sequence[str] | None
 ) -> FoundResults:
-    """Return the results of the runs in these folders whose scene and model fit a pattern ("lego*"; None: all)."""
+    """Return the results of the runs in these folders whose scene and model match a pattern ("lego*"; None: all)."""
     read = {run: read_result(run, measured) for run in find_runs(folders)}
     results = [result for result in read.values() if result is not None]
     if not results:
@@ -81,7 +81,7 @@ def _fits(name: str, patterns: Sequence[str] | None) -> bool:
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Return the run folders in these folders, and what `nerf eval` wrote on its own, below each of these folders."""
+    """Return the run folders, and the output folders of `nerf eval`, below each of these folders."""
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"runs={folder}: {folder} {what_is(folder)}. Give run folders, or folders that hold some.")
@@ -106,7 +106,7 @@ def _runs_below(folder: Path) -> Iterator[Path]:
 
 
 def read_result(folder: Path, measured: Measured) -> RunResult | None:
-    """Return what a run reached, None where it was not measured."""
+    """Return the result of a run; None if it was not measured."""
     own = "metrics.json" if not (folder / "run.json").exists() else FILES[measured]
     metrics = read_json_object(folder / own)
     if number(metrics.get("psnr")) is None:
@@ -121,7 +121,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     values["steps"] = number(origin.get("step")) if run.steps is None else run.steps
     seconds = number(note.get("training_seconds"))
     values["minutes"] = None if seconds is None else seconds / 60
-    # `scene@PACKAGE` picks from the group that `scene` picks from.
+    # `scene@PACKAGE` picks from the same group as `scene`.
     settings = {k: v for k, v in run.overrides.items() if meaning_of(k.lstrip("+~").partition("@")[0]).shown}
     return RunResult(
         summary=run,
@@ -136,7 +136,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
 
 
 def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
-    """Return the scene's name; where it bears its format's alone, that of the folder or file it was read from."""
+    """Return the scene's name; if that is only its format's, the name of its folder or file."""
     name = str(protocol.get("scene", "")) or "not said"
     if name != str(origin.get("scene", overrides.get("scene"))):
         return name
@@ -145,7 +145,7 @@ def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict
 
 
 def _choices(folder: Path) -> dict[str, Any]:
-    """Return the scene and the model that were picked, for results that do not name them."""
+    """Return the picked scene and model, for results that do not name them."""
     try:
         choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
         return {key: choices[key] for key in ("scene", "model")}

@@ -1,4 +1,4 @@
-"""Which run a command resumes, and whether it is a run with these settings.
+"""Find the run that a command resumes, and check that it has the same settings.
 
 `checkpoints.reading.newest_checkpoint` chooses among its checkpoints.
 """
@@ -23,14 +23,14 @@ from nerf_lightning.runs.summary import folders_of_runs, read_note
 
 log = logging.getLogger(__name__)
 
-UNKNOWN = "unknown"  # What stands for the value of a setting where a config does not have it
+UNKNOWN = "unknown"  # Placeholder for the value of a setting that a config does not have
 
 
 def run_to_resume(path: Path) -> Path:
     """Return the run folder that `resume=PATH` names: a run folder, or a checkpoint in one.
 
     Raises:
-        InputError: there is no such checkpoint, or no run.
+        InputError: there is no such checkpoint or run.
     """
     folder = path.parent.parent if path.suffix == ".ckpt" else path
     if path.suffix == ".ckpt" and not path.is_file():
@@ -44,18 +44,19 @@ def run_to_resume(path: Path) -> Path:
 
 
 def require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
-    """Refuse a folder whose run has other settings, or the same ones if it is not to be resumed.
+    """Refuse a folder whose run has other settings, or the same ones if it must not be resumed.
 
-    Settings that came into the program after the run began may be added.
+    Settings that were introduced after the run began may be added.
 
     Args:
-        folder: of the run that is there.
-        identity: the settings that make out a run (`run_identity`), of this command.
+        folder: of the existing run.
+        identity: the settings that define a run (`run_identity`), of this command.
         typed: the settings on the command line.
-        resuming: whether what is there is to be resumed.
+        resuming: whether to resume the existing run.
 
     Raises:
-        InputError: the folder holds another run, the same one though nothing is to be resumed, or a damaged `run.json`.
+        InputError: the folder contains another run, the same one although it must not be resumed, or a damaged
+            `run.json`.
     """
     begun_with, note = read_note(folder).get("fingerprint"), folder / "run.json"
     if begun_with is None:
@@ -86,22 +87,22 @@ def require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], re
 
 
 def _newer_settings(folder: Path, identity: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """Return the settings that came into the program after a run was begun; none where anything else differs."""
+    """Return the settings that were introduced after a run began; none if anything else differs."""
     known = {key: value for key, value in identity.items() if key in other}
     return sorted(identity.keys() - other.keys()) if known == other and _is_as_begun(folder, other) else []
 
 
 def _is_as_begun(folder: Path, other: dict[str, Any]) -> bool:
-    """Return whether the run in a folder began with what its config says now.
+    """Return whether the run in a folder began with its present config.
 
-    Versions up to 1.0.0 counted the budget to a run's identity.
+    Versions up to 1.0.0 included the budget in a run's identity.
     """
     budget = leaves(read_plain_yaml(folder / ".hydra" / "config.yaml").get("budget"), "budget")
     return read_note(folder).get("fingerprint") in (fingerprint(other), fingerprint(other | budget))
 
 
 def _former_identity(folder: Path) -> dict[str, Any] | str:
-    """Return what the run in a folder is, by the config that it was begun with, or why that is not known."""
+    """Return the identity of the run in a folder, from its original config, or why it is unknown."""
     saved = folder / ".hydra" / "config.yaml"
     if not saved.is_file():
         return "its config was not kept"
@@ -117,13 +118,13 @@ def _former_identity(folder: Path) -> dict[str, Any] | str:
 def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
     pairs = {key: (other.get(key, UNKNOWN), identity.get(key, UNKNOWN)) for key in identity.keys() | other.keys()}
     differing = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
-    keys = sorted(differing, key=lambda key: (key not in other, key))  # what came after the run began is told last
+    keys = sorted(differing, key=lambda key: (key not in other, key))  # settings newer than the run come last
     shown = ", ".join("{}: there {}, here {}".format(key, *differing[key]) for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 
 def newest_unfinished(root: Path, digest: str, length: tuple[int, float | None], of_job: str | None) -> Path | None:
-    """Return the folder of the newest run with these settings that is not complete; None where there is none.
+    """Return the folder of the newest incomplete run with these settings; None if there is none.
 
     Args:
         root: the folder of all runs.
@@ -141,7 +142,7 @@ def newest_unfinished(root: Path, digest: str, length: tuple[int, float | None],
 
 
 def _is_over(note: Mapping[str, Any], num_steps: int, seconds: float | None) -> bool:
-    """Return whether a run has finished and would take no further step with so many steps and seconds."""
+    """Return whether a run has finished and would take no further step with `num_steps` and `seconds`."""
     finished, used = number(note.get("finished_at_step")), number(note.get("budget_seconds"))
     if finished is None:
         return False
@@ -149,9 +150,9 @@ def _is_over(note: Mapping[str, Any], num_steps: int, seconds: float | None) -> 
 
 
 def former_config(config: DictConfig, job_folder: Path | None) -> Mapping[str, Any] | None:
-    """Return what a folder keeps of its run's config, where it is known before the run is; None where there is none.
+    """Return the run config that a folder keeps, if the folder is known before the run; None if there is none.
 
-    Nothing in it is built: the folder may come from anybody.
+    Nothing in it is built: the folder is untrusted.
     """
     named = required_path("resume", config.resume) if config.resume not in (None, "auto") else None
     path = named or job_folder or config.paths.output_dir
@@ -161,5 +162,5 @@ def former_config(config: DictConfig, job_folder: Path | None) -> Mapping[str, A
     try:
         content = read_plain_yaml(folder / ".hydra" / "config.yaml")
     except InputError:
-        return None  # whoever goes on with it is told
+        return None  # resuming it reports the error
     return content if isinstance(content, dict) else None

@@ -1,6 +1,6 @@
-"""Run folders: chosen before anything is written, held by one process, never shared by two configs.
+"""Run folders: chosen before anything is written, held by one process, never shared between two configs.
 
-A run folder has `run.json` (its config's fingerprint, and what it came to), `.hydra/` (config and overrides),
+A run folder contains `run.json` (its config's fingerprint, and its outcome), `.hydra/` (config and overrides),
 `checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
 """
 
@@ -42,14 +42,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """Where training goes on, and what must stay as it was there; small enough to be sent between processes."""
+    """Where training resumes, and what must stay unchanged; small enough to be sent between processes."""
 
     checkpoint: Path
     step: int
     precision: str
     tile_points: int | None
     num_steps: int
-    """Where the run was to end; of one that did not note it, its steps so far."""
+    """The planned length of the run; if it was not noted, the steps so far."""
 
 
 @dataclass
@@ -59,14 +59,14 @@ class RunFolder:
     path: Path
     lock: FileLock
     named_checkpoint: Path | None
-    """The checkpoint that the user named to go on from."""
+    """The checkpoint that the user named to resume from."""
     began: float = field(default_factory=time.monotonic)
 
     def resume_point(self) -> ResumePoint | None:
-        """Read the checkpoint that the user named, else the newest that is whole; None where nothing was saved.
+        """Read the checkpoint that the user named, else the newest intact one; None if nothing was saved.
 
         Raises:
-            InputError: there are checkpoints, and none can be read.
+            InputError: there are checkpoints, but none can be read.
         """
         folder, named = self.path / "checkpoints", self.named_checkpoint
         found = newest_checkpoint(folder, True) if named is None else read_checkpoint(named, True)
@@ -74,7 +74,7 @@ class RunFolder:
             return None
         path = found.path
         if named is None and path.name == PREVIOUS:
-            # Else the next save would put the damaged one in the place of the good one.
+            # Otherwise the next save would replace the good one with the damaged one.
             with contextlib.suppress(FileNotFoundError):
                 persistently(os.replace, folder / LAST, folder / DAMAGED)
             persistently(os.replace, path, folder / LAST)
@@ -83,16 +83,16 @@ class RunFolder:
         return ResumePoint(path, found.step, found.precision, found.tile_points, max(found.step, planned))
 
     def trained(self, seconds: float) -> None:
-        """Note how long this start has trained, from its first step to its last, and how long all else took before now.
+        """Note how long training took since this start, from its first step to its last, and all else until now.
 
-        A run that is gone on with counts on.
+        A resumed run adds to its earlier times.
         """
         note, here = read_note(self.path), time.monotonic() - self.began
         spent = {"training_seconds": seconds, "setup_seconds": here - seconds}
         self.note(**{key: round((number(note.get(key)) or 0.0) + value, 1) for key, value in spent.items()})
 
     def note(self, **values: Any) -> None:
-        """Add values to `run.json`: `num_steps`, how long the run is to be; `finished_at_step`, once it is complete.
+        """Add values to `run.json`: `num_steps`, the planned length; `finished_at_step`, once the run is complete.
 
         Raises:
             InputError: the folder is gone.
@@ -105,7 +105,7 @@ class RunFolder:
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
 
     def release(self) -> None:
-        """Let others have the folder."""
+        """Release the folder to others."""
         self.lock.release()
 
 
@@ -116,13 +116,14 @@ def open_run(
     asked: DictConfig | None = None,
     typed: Sequence[str] = (),
 ) -> RunFolder:
-    """Choose the run's folder, refuse it or take hold of it, and write down the config.
+    """Choose the run's folder, refuse or lock it, and write the config.
 
     Args:
         config: the run's config.
-        num_steps: its length; a run that finished earlier counts as unfinished, as does one with a shorter budget.
+        num_steps: its length; a run that finished with fewer steps counts as unfinished, as does one with a shorter
+            budget.
         job_folder: the folder that a sweep gives this job, or None for a single run.
-        asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand.
+        asked: the config before anything was chosen for the scene, which is what a sweep knows about a job in advance.
         typed: the overrides of the command line.
 
     Raises:
@@ -175,13 +176,13 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
         "overrides.yaml": OmegaConf.create(list(hydra_config.overrides.task)),
     }
     for name, content in kept.items():
-        # Whole or not at all: a resume by the folder's name reads them.
+        # Atomically: a resume by the folder's name reads them.
         with whole_file(folder / ".hydra" / name) as part:
             OmegaConf.save(content, part)
 
 
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> tuple[Path, bool]:
-    """Return the folder, and whether what is there is to be gone on with."""
+    """Return the folder, and whether to resume its run."""
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
         return run_to_resume(Path(required_path("resume", resume))), True
@@ -205,14 +206,14 @@ def _fresh(parent: Path) -> Path:
 
 @contextlib.contextmanager
 def log_file(folder: Path) -> Iterator[None]:
-    """Append all that is logged to `train.log` in a run folder.
+    """Append all log messages to `train.log` in a run folder.
 
     Raises:
-        InputError: what has this name is no regular file.
+        InputError: something of this name is not a regular file.
         OSError: it cannot be opened.
     """
     with open_to_append(folder / "train.log", "Remove it.") as file:
-        # Written as it comes: nothing waits for the end, where a full disk would be an error once more.
+        # Unbuffered: nothing is left to write at the end, when a full disk would raise another error.
         unbuffered: Any = file.raw
         handler = _Handler(io.TextIOWrapper(unbuffered, "utf-8", write_through=True))
         handler.setFormatter(EscapingFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
@@ -225,6 +226,6 @@ def log_file(folder: Path) -> Iterator[None]:
 
 class _Handler(logging.StreamHandler):
     def handleError(self, record: logging.LogRecord) -> None:
-        """Lose a line that the disk has no room for: the console has it, and what matters is told by who writes it."""
+        """Drop a line that does not fit on the disk: the console shows it, and writers report errors that matter."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)

@@ -1,7 +1,7 @@
-"""The overrides that a run or a sweep was started with, repeated where it is gone on with by its folder's name.
+"""The overrides that a run or a sweep was started with, repeated if it is resumed by its folder's name.
 
-The folder may come from anybody: what the table in config/setting_rules.py does not trust to files, and the choice of
-loggers, is taken from the command line alone.
+The folder is untrusted: settings that the table in config/setting_rules.py does not let files set, and the choice of
+loggers, are taken only from the command line.
 """
 
 import logging
@@ -22,7 +22,7 @@ from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
 
-# What Hydra's parser, which takes quadratic time and more, reads in a second or two: in all, in a line, brackets deep.
+# Limits that Hydra's parser, which takes quadratic time or more, handles in a second or two: total, per line, nesting.
 MOST_CHARACTERS, LONGEST, DEEPEST = 1 << 13, 1 << 11, 8
 OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[A-Za-z][\w-]*(\.[A-Za-z][\w-]*)*", re.ASCII)
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 
 def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
-    """Return what a run was started with, but for what belongs to one start and what the user gives again.
+    """Return a run's original overrides, except those that belong to one start and those that the user gives again.
 
     Raises:
-        InputError: the file is no list of overrides, or holds one that is not repeated from files.
+        InputError: the file is not a list of overrides, or contains one that is not repeated from files.
     """
     saved = run_folder / ".hydra" / "overrides.yaml"
     try:
@@ -50,13 +50,13 @@ def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
 
 
 def former_sweep(sweep_folder: Path, arguments: Sequence[str]) -> list[str]:
-    """Return what a sweep was started with; see `former_overrides`."""
+    """Return a sweep's original overrides; see `former_overrides`."""
     record = read_sweep(sweep_folder)
     return [] if record is None else list(_repeated(record.typed(), arguments, sweep_record(sweep_folder), True))
 
 
 def to_give_again(overrides: Iterable[str], of_sweep: bool = False) -> list[str]:
-    """Return, as typed in a shell, those overrides of a run or a sweep that are not repeated from its folder."""
+    """Return, as typed in a shell, the overrides of a run or a sweep that are not repeated from its folder."""
     judged = ((line, *_judged(line, of_sweep)) for line in overrides)
     return [shlex.quote(line) for line, key, fate in judged if fate == "type again" or key == "logger"]
 
@@ -84,15 +84,15 @@ def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sw
 
 
 def _judged(line: str, of_sweep: bool) -> tuple[str, Fate]:
-    """Return what an override sets, and what becomes of it."""
+    """Return the key that an override sets, and what happens to it."""
     depth = max(accumulate((each in "[{(") - (each in "]})") for each in line), default=0)
-    # Options of Hydra's own command line, such as --config-dir, are no overrides.
+    # Options of Hydra's own command line, such as --config-dir, are not overrides.
     if line.startswith("-") or len(line) > LONGEST or depth > DEEPEST:
         return "", "type again"
     try:
         override = parse(line)
         key = override.key_or_group
-        # Jobs of a sweep that have not begun start from its checkpoint still.
+        # Jobs of a sweep that have not begun still start from its checkpoint.
         if meaning_of(key.replace("/", ".")).trust is Trust.ONE_START or (key == "init_from" and not of_sweep):
             return key, "leave out"
         return key, "repeat" if _is_harmless(override, of_sweep) else "type again"
@@ -112,7 +112,7 @@ def _is_harmless(override: Override, of_sweep: bool) -> bool:
     values = [override.value()]
     if override.value_type in (ValueType.CHOICE_SWEEP, ValueType.SIMPLE_CHOICE_SWEEP):
         values = [parse(f"key={value}").value() for value in override.sweep_string_iterator()]
-    elif override.is_sweep_override():  # a name that stands for those of our own options, or a number for a range
+    elif override.is_sweep_override():  # sample values: a word for our own options, a number for a range
         values = ["any" if override.is_choice_sweep() else 0]
     return all(_is_taken(key, value) for value in values)
 

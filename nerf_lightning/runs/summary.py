@@ -1,4 +1,4 @@
-"""What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
+"""Summarize a run folder from `run.json`, `metrics.json` and `.hydra/`."""
 
 import re
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ DECIMAL = re.compile(r"[-+]?(\d+\.\d*|\.\d+|\d+(?=[eE]))([eE][-+]?\d+)?")
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A run in one row; None where the folder does not say."""
+    """A run in one row; None if the folder does not say."""
 
     folder: Path
     overrides: dict[str, str]
-    """What was given on the command line, by key."""
+    """Overrides from the command line, by key."""
     psnr: float | None
     ssim: float | None
     steps: int | None
     """The step at which the run finished."""
     seconds: float | None
-    """Time in training, evaluation and film, of all starts but those that were killed."""
+    """Time in training, evaluation and film, of all starts except those that were killed."""
     started: str | None = None
-    """When the run was begun, such as 2026-11-21T10:00:00."""
+    """When the run began, such as 2026-11-21T10:00:00."""
 
 
 def read_run(folder: Path) -> RunSummary:
-    """Return what a folder says, finished or not."""
+    """Return the summary of a run, finished or not."""
     note, metrics = read_note(folder), read_json_object(folder / "metrics.json")
     steps = number(note.get("finished_at_step"))
     return RunSummary(
@@ -48,17 +48,17 @@ def read_run(folder: Path) -> RunSummary:
 
 
 def read_note(folder: Path) -> dict[str, Any]:
-    """Return the content of `run.json`, empty where it is missing or damaged."""
+    """Return the content of `run.json`; empty if it is missing or damaged."""
     return read_json_object(folder / "run.json")
 
 
 def folders_of_runs(root: Path) -> list[Path]:
-    """Return the folders below one, and itself, that hold a `run.json`."""
+    """Return the folders below `root`, including itself, that contain a `run.json`."""
     return [folder for folder, _, names in walk(root) if "run.json" in names]
 
 
 def by_key(overrides: list[str]) -> dict[str, str]:
-    """Return overrides as a mapping, numbers in one way of writing; what is given twice holds as given last.
+    """Return overrides as a mapping with numbers in one notation; the last of several values counts.
 
     >>> by_key(["model=nerf_tiny", "optimizer.lr=2e-2", "seed=0", "seed=1"])
     {'model': 'nerf_tiny', 'optimizer.lr': '0.02', 'seed': '1'}
@@ -68,17 +68,17 @@ def by_key(overrides: list[str]) -> dict[str, str]:
 
 
 def told_settings(overrides: dict[str, str]) -> dict[str, str]:
-    """Return overrides by the names that columns have: a class stands for its group, and that it was added is not said.
+    """Return overrides by their column names: a class represents its group, and a leading + is dropped.
 
     >>> told_settings({"loss._target_": "my_losses.L1", "+loss.part": "0.5"})
     {'loss.part': '0.5', 'loss': 'my_losses.L1'}
     """
-    given = sorted(overrides.items(), key=lambda pair: pair[0].endswith(CLASS))  # a class has the last word
+    given = sorted(overrides.items(), key=lambda pair: pair[0].endswith(CLASS))  # a class takes precedence
     return {key.lstrip("+").removesuffix(CLASS): value for key, value in given}
 
 
 def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Return the keys that not all settings have, or have the same value of, in the order in which they first come.
+    """Return the keys that are missing or differ in some settings, in the order of their first appearance.
 
     >>> differing_keys([{"model": "nerf_tiny", "seed": "0"}, {"model": "nerf_tiny", "seed": "1"}])
     ['seed']

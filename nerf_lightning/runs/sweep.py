@@ -1,4 +1,4 @@
-"""A sweep as its own process sees it: the command to resume it, the jobs' cores, and Ctrl-C."""
+"""A sweep in its own process: the command to resume it, the jobs' cores, and Ctrl-C."""
 
 import logging
 import math
@@ -29,13 +29,13 @@ from nerf_lightning.runs.sweep_table import job_rows
 
 log = logging.getLogger(__name__)
 
-# Launchers whose jobs are processes of this machine; those of the others go on when this process is stopped.
+# Launchers whose jobs are processes of this machine; jobs of the others continue when this process is stopped.
 LOCAL_LAUNCHERS = (".JoblibLauncher", ".LocalLauncher")
 
 
 @dataclass
 class Sweep:
-    """A sweep that has begun."""
+    """A running sweep."""
 
     command: str
     folder: Path
@@ -43,25 +43,25 @@ class Sweep:
     received: int | None = None
     """The signal that stopped it."""
     made: list[Path] = field(default_factory=list)
-    """Its folder and those around it that were not there before, the innermost first."""
+    """Its folder and parents that it newly made, the innermost first."""
     former_handlers: dict[int, Any] = field(default_factory=dict)
 
     def go_on_with(self) -> str:
-        """Return the command that goes on with it."""
+        """Return the command that resumes it."""
         folder = to_type("paths.output_dir", str(self.folder))
         again = to_give_again(self.record.typed(), of_sweep=True)
         return " ".join([self.command, "-m sweep.resume=true", folder, *again])
 
 
-# Hydra builds its callbacks itself, so that what they learn has to be kept outside.
+# Hydra builds its callbacks itself, so their state must be kept outside.
 _begun: list[Sweep] = []
 
 
 class SweepWatch(Callback):
-    """Hydra's word that a sweep begins, in the process that the user started."""
+    """Hydra's notification that a sweep begins, in the process that the user started."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write down what was asked for, say how to go on after a stop, and share out the cores."""
+        """Record the arguments, log how to resume after a stop, and distribute the cores."""
         asked: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
         record = SweepRecord([*asked["hydra"], *asked["task"]], slurm_job())
         sweep = Sweep(sys.argv[0], Path(config.hydra.sweep.dir), record)
@@ -72,7 +72,7 @@ class SweepWatch(Callback):
         if "sweep" in config:
             said = f"sweep folder {sweep.folder}; if it stops, resume with: {sweep.go_on_with()}"
             print(for_terminal(said), file=sys.stderr)
-        # Optuna's database library lists its parts.
+        # Optuna's database library logs its parts.
         logging.getLogger("alembic").setLevel(logging.WARNING)
         os.environ[NUM_JOBS] = _num_jobs(config.hydra)
         launcher = config.hydra.launcher._target_
@@ -83,7 +83,7 @@ class SweepWatch(Callback):
 
 
 def watched(run: Callable[[], None]) -> None:
-    """Run a sweep, and say at its end, however it ends, what its jobs came to.
+    """Run a sweep, and report its jobs' outcomes at its end, however it ends.
 
     Raises:
         InputError: some jobs failed.
@@ -107,7 +107,7 @@ def watched(run: Callable[[], None]) -> None:
 
 
 def _end() -> list[JobRecord]:
-    # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
+    # Imported late: they import torch, and Hydra loads this module before it composes any command's config.
     from nerf_lightning.messages.console import say
     from nerf_lightning.runs.table_files import write_csv, write_markdown
     from nerf_lightning.runs.table_screen import print_rows
@@ -131,7 +131,7 @@ def _end() -> list[JobRecord]:
 
 
 def _remove_refused(sweep: Sweep) -> bool:
-    """Remove what a sweep has made none of whose jobs has begun; tell whether there was nothing else."""
+    """Remove what a sweep made if none of its jobs has begun; return whether there was nothing else."""
     folder = sweep.folder
     if any(path.name not in (".hydra", "multirun.yaml") for path in folder.iterdir()):
         return False
@@ -142,7 +142,7 @@ def _remove_refused(sweep: Sweep) -> bool:
 
 
 def _num_jobs(hydra: DictConfig) -> str:
-    """Return how many jobs there will be, empty where the sweeper decides it as it goes."""
+    """Return how many jobs there will be; empty if the sweeper decides as it goes."""
     if not hydra.sweeper._target_.endswith(".BasicSweeper"):
         return str(hydra.sweeper.get("n_trials") or "")
     parsed = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
@@ -163,8 +163,7 @@ def _complain(bad: list[JobRecord], total: int, error: Exception | None) -> None
 
 
 def _share_cores(launcher: str, settings: DictConfig) -> None:
-    # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local jobs are
-    # told nothing.
+    # joblib divides them by its number of jobs and sets OMP_NUM_THREADS for each; submitit's local jobs get no limit.
     os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
     if launcher.endswith(".LocalLauncher"):
         os.environ.setdefault("OMP_NUM_THREADS", str(settings.cpus_per_task or 1))
@@ -177,7 +176,7 @@ def _pass_signals_on(sweep: Sweep) -> None:
         sweep.received = number
         stop_file(sweep.folder).touch()
         log.info("stopping: running jobs finish their step and save")
-        # Those that train see the file. A signal also stops the others, but on Windows it would let nobody save.
+        # Training jobs see the file. A signal also stops the others, but on Windows it would not let them save.
         for record in read_records(sweep.folder) if os.name == "posix" else ():
             if record.state == "running" and psutil.pid_exists(record.process):
                 os.kill(record.process, signal.SIGTERM)

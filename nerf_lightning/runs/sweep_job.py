@@ -1,7 +1,7 @@
-"""One job of a sweep: skip it where it was done before, run it, and leave a record of how it ended.
+"""One job of a sweep: skip it if it was done before, run it, and write a record of how it ended.
 
-Jobs may run in other processes and on other machines; what the sweep's own process must know of them goes through
-files in the sweep's folder. A job that fails returns None, so that the sweep goes on with the others.
+Jobs may run in other processes and on other machines; they report to the sweep's own process through files in the
+sweep's folder. A job that fails returns None, so that the sweep continues with the others.
 """
 
 import logging
@@ -22,14 +22,14 @@ from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.runs.identity import settings_digest
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 
-NUM_JOBS = "NERF_LIGHTNING_JOBS"  # In the environment of the jobs: how many there are
+NUM_JOBS = "NERF_LIGHTNING_JOBS"  # In the environment of the jobs: their number
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """How a job stands."""
+    """The state of a job."""
 
     number: int
     overrides: list[str]
@@ -39,12 +39,12 @@ class JobRecord:
     reason: str = ""
 
     def write(self, sweep_folder: Path) -> None:
-        """Leave the record for the sweep's own process."""
+        """Write the record for the sweep's own process."""
         write_json(make_folder(records_folder(sweep_folder)) / f"{self.number}.json", asdict(self))
 
 
 def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:
-    """Run one job of a sweep (what a command does, with its config) and return its value, None where it failed.
+    """Run one job of a sweep (a command with its config) and return its value; None if it failed.
 
     Raises:
         SystemExit: a signal stopped the job, which stops a sweep whose jobs run in one process.
@@ -53,12 +53,12 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     sweep_folder, own = Path(hydra.sweep.dir), Path(hydra.runtime.output_dir)
     elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
     if elsewhere:
-        # Imported late: rich takes its time, and this file is read before any command.
+        # Imported late: rich is slow to import, and this file is read before any command.
         from nerf_lightning.messages.console import label_lines
 
-        # The sweep's own process hears Ctrl-C and passes it on to the jobs that run.
+        # The sweep's own process receives Ctrl-C and passes it on to the running jobs.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        # Bars of several processes on one terminal overwrite each other; rich asks this variable.
+        # Bars of several processes on one terminal overwrite each other; rich reads this variable.
         os.environ["TTY_COMPATIBLE"] = "0"
         label_lines(job_label(int(hydra.job.num), own, list(hydra.overrides.task)))
         if stop_file(sweep_folder).exists():
@@ -75,7 +75,7 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
         remove_empty(own)
         return None
     except (SystemExit, KeyboardInterrupt) as stop:
-        if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started
+        if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job started
             replace(record, state="failed", reason="see its messages above").write(sweep_folder)
             return None
         replace(record, state="stopped").write(sweep_folder)
@@ -97,7 +97,7 @@ def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
 
 
 def job_label(number: int, folder: Path, overrides: list[str]) -> str:
-    """Return what tells a job from those beside it: its number, and the settings that its folder is called by.
+    """Return what distinguishes a job from parallel ones: its number, and the settings in its folder's name.
 
     >>> job_label(2, Path("2_optimizer.lr=0.01"), ["model=fast", "optimizer.lr=0.01"])
     '[3 lr=0.01]'
@@ -117,20 +117,20 @@ def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecor
 
 
 def read_records(sweep_folder: Path) -> list[JobRecord]:
-    """Return what the jobs of a sweep have left, in their order."""
-    # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
+    """Return the records of a sweep's jobs, in order."""
+    # Skip names that begin with a dot: a job may be writing its record, or was killed while it did.
     files = records_folder(sweep_folder).glob("[!.]*.json")
     records = [JobRecord(**read_json(file)) for file in files]
     return sorted(records, key=lambda record: record.number)
 
 
 def records_folder(sweep_folder: Path) -> Path:
-    """Return where the jobs leave their records."""
+    """Return the folder of the jobs' records."""
     return sweep_folder / ".hydra" / "jobs"
 
 
 def stop_file(sweep_folder: Path) -> Path:
-    """Return the file that keeps waiting jobs from starting, and lets those that train save and stop."""
+    """Return the file that keeps waiting jobs from starting, and makes training jobs save and stop."""
     return sweep_folder / ".hydra" / "stop"
 
 
@@ -142,7 +142,7 @@ def _former_run(sweep_folder: Path, own: Path, config: DictConfig) -> Path | Non
 
 
 def finished_run(folders: Iterable[Path], config: DictConfig) -> Path | None:
-    """Return the first folder whose run did all that this config asks for, or None."""
+    """Return the first folder whose run did everything in this config, or None."""
     digest = settings_digest(config)
     for folder in folders:
         note = read_note(folder)

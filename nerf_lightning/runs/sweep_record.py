@@ -1,4 +1,4 @@
-"""What a sweep was started with, kept in its folder and read where it is gone on with."""
+"""The original arguments of a sweep, kept in its folder and read when it is resumed."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,35 +12,35 @@ from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
 MADE = ("hydra.mode=", "hydra.sweep.", "sweep.")
-"""What was made of the arguments, or belongs to one start: it is made again."""
+"""Arguments that were derived, or that belong to one start: they are derived again."""
 
 
 @dataclass(frozen=True)
 class SweepRecord:
-    """What a sweep was started with, as its folder says; the folder may come from anybody."""
+    """The original arguments of a sweep, from its untrusted folder."""
 
     arguments: list[str]
     slurm_job: str | None = None
 
     def write(self, sweep_folder: Path) -> None:
-        """Leave it in the sweep's folder."""
+        """Write it to the sweep's folder."""
         record = sweep_record(sweep_folder)
         make_folder(sweep_folder, record.parent.name)
         with whole_file(record) as part:
             part.write_text(yaml.safe_dump({"arguments": self.arguments, "slurm_job": self.slurm_job}))
 
     def typed(self) -> list[str]:
-        """Return the arguments without what was made of them."""
+        """Return the arguments without derived ones."""
         return [argument for argument in self.arguments if not argument.startswith(MADE)]
 
 
 def sweep_record(sweep_folder: Path) -> Path:
-    """Return the file that says what a sweep was started with."""
+    """Return the file with the original arguments of a sweep."""
     return sweep_folder / ".hydra" / "sweep.yaml"
 
 
 def read_sweep(sweep_folder: Path) -> SweepRecord | None:
-    """Return what a sweep was started with, None where the folder holds no sweep."""
+    """Return the record of a sweep; None if the folder contains no sweep."""
     record = sweep_record(sweep_folder)
     try:
         content = read_plain_yaml(record)

@@ -8,7 +8,7 @@ from nerf_lightning.runs.sweep_job import JobRecord
 
 
 def job_rows(records: list[JobRecord], sweep_folder: Path) -> list[dict[str, Any]]:
-    """Return a row per job, sorted by PSNR; what no job has, or all have the same of, is left out of the settings."""
+    """Return a row per job, sorted by PSNR; settings that are the same for all jobs are left out."""
     runs = {record.number: read_run(Path(record.folder)) for record in records}
     settings = {record.number: told_settings(by_key(record.overrides)) for record in records}
     swept = differing_keys(list(settings.values()))

@@ -33,23 +33,23 @@ PLAIN = {
     "megabytes": "MB",
 }
 """Columns with the mean alone."""
-ORDERS = (*SPREAD, *PLAIN, "model")  # What rows may be sorted by
+ORDERS = (*SPREAD, *PLAIN, "model")  # Keys by which rows may be sorted
 HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
 CHOOSE_PICTURES = ("split", "resolution", "masks", "downscale", "filter", "hold_every", "frames")
-"""Where these differ, so do the pictures, and that need not be said again."""
+"""If these differ, so do the pictures, which need not be reported separately."""
 NOTED = ("version", "commit", "device", "precision")
-"""What may move the numbers a little: named below the table if it differs."""
+"""What may change the numbers slightly: noted below the table if it differs."""
 MOST_SETTINGS = 32
-"""Columns of settings by which runs differ: a stranger's run may have thousands."""
+"""Maximum number of columns for differing settings: an untrusted run may have thousands."""
 MOST_LETTERS = 80
 
 Group = list[RunResult]
 
 
 def result_table(found: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
-    """Return the rows, in one of `ORDERS`, and the lines that belong below them.
+    """Return the rows, in one of `ORDERS`, and the notes below them.
 
-    `force` puts results together that were not measured alike.
+    `force` combines results that were not measured in the same way.
     """
     notes = one_protocol(found.measured, force)
     groups, left_out = group_seeds(found.measured)
@@ -74,14 +74,14 @@ def result_table(found: FoundResults, order: str, published: bool, force: bool) 
 
 
 def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
-    """Return what is to be said of how the results were measured, a line for each difference.
+    """Return notes on how the results were measured, a line for each difference.
 
     Raises:
-        InputError: not all in the same way, and not `force`.
+        InputError: they were not all measured in the same way, and `force` is false.
     """
     first_of: dict[str, RunResult] = {}
     pairs: dict[str, str] = {}
-    # A result without LPIPS agrees with all backbones: what is compared with is one that has a backbone.
+    # A result without LPIPS agrees with all backbones: compare with one that has a backbone.
     results = sorted(results, key=lambda result: result.protocol.get("lpips") is None)
     for result in results:
         first = first_of.setdefault(result.scene, result)
@@ -99,7 +99,7 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
 
 
 def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
-    """Return what keeps two results from being compared, in words and in settings that people know."""
+    """Return why two results cannot be compared, in words and as settings."""
     found = dict(each.split(": ", 1) for each in differences(one.protocol, other.protocol, same_scene))
     is_other_pictures = found.pop("split_hash", None) is not None and not found.keys() & {*CHOOSE_PICTURES}
     told = [f"{key}: {values}" for key, values in found.items()]
@@ -125,7 +125,7 @@ def _chooses_pictures(key: str) -> bool:
 
 
 def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResult]]:
-    """Return results that differ by their seed alone together, and older ones of a seed that is there, left out."""
+    """Group results that differ only by seed; return the groups, and older duplicates of a seed, which are left out."""
     groups: dict[tuple[object, ...], dict[int | None, RunResult]] = {}
     left_out = []
     for result in sorted(results, key=lambda result: (result.summary.started or "", str(result.folder)), reverse=True):
@@ -142,7 +142,7 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
 
 
 def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
-    """Return the rows with what others have published below those of each scene."""
+    """Return the rows with published results below those of each scene."""
     reader = {result.scene: str(result.origin.get("scene", "")) for result in results}
     empty: Row = dict.fromkeys(rows[0])
     table: list[Row] = []
@@ -172,7 +172,7 @@ def _row(group: Group, shown: list[str]) -> Row:
 
 
 def _values_of(folder: Path, keys: Sequence[str]) -> dict[str, str]:
-    """Return what a run had for settings that nobody gave: the number or word, or the option of a group."""
+    """Return a run's values of settings that were not given: the number or word, or the option of a group."""
     if not keys:
         return {}
     try:
@@ -185,7 +185,7 @@ def _values_of(folder: Path, keys: Sequence[str]) -> dict[str, str]:
 
 
 def _resolution(result: RunResult) -> str:
-    """Return the size of the pictures that were measured; of several sizes, the smallest and how many more."""
+    """Return the size of the measured pictures; of several sizes, the smallest and the number of others."""
     found, sizes = result.protocol.get("resolution"), []
     for size in found if isinstance(found, list) else ():
         match size:
@@ -195,7 +195,7 @@ def _resolution(result: RunResult) -> str:
 
 
 def _spread(group: Group, key: str) -> tuple[float | None, float | None]:
-    """Return mean and standard deviation (of the population that the seeds are drawn from)."""
+    """Return mean and standard deviation (of the population from which the seeds are drawn)."""
     values = [value for result in group if (value := result.values.get(key)) is not None]
     if len(values) < len(group):
         return None, None

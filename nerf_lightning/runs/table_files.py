@@ -1,6 +1,6 @@
-"""Rows of a table, written as markdown for people and as CSV with all digits.
+"""Rows of a table, written as Markdown for reading and as CSV with all digits.
 
-Texts in them may come from anybody's run folders: they stay text, in a browser and a spreadsheet.
+Texts from untrusted run folders stay text in a browser and a spreadsheet.
 """
 
 import csv
@@ -20,8 +20,8 @@ DECIMALS = {
     **{"SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4, "steps": 0, "parameters": 0, "runs": 0},
     **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
 }
-"""Columns of numbers, and the digits that are shown."""
-SECONDS = {"seconds": 1, "minutes": 60}  # Columns of times, in seconds each
+"""Columns of numbers, and their number of decimals."""
+SECONDS = {"seconds": 1, "minutes": 60}  # Columns of times, and their units in seconds
 
 
 def write_csv(rows: list[Row], path: Path) -> None:
@@ -32,7 +32,7 @@ def write_csv(rows: list[Row], path: Path) -> None:
 
 
 def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> None:
-    """Write the rows as a table of Markdown, with the notes below."""
+    """Write the rows as a Markdown table, with the notes below."""
     head, *lines = ([*map(for_markdown, line)] for line in (rows[0], *([shown(row, c) for c in row] for row in rows)))
     text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *lines))
     with whole_file(path) as part:
@@ -40,9 +40,9 @@ def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> No
 
 
 def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
-    """Return the texts of each column as a person reads them.
+    """Return the displayed texts of each column.
 
-    Deviations stand beside their means, all times are in one column, and what others have published says so.
+    Deviations follow their means, all times are in one column, and published results are marked.
     """
     columns: dict[str, list[str]] = {}
     for name in rows[0]:
@@ -58,13 +58,13 @@ def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
 
 
 def shown(row: Row, column: str) -> str:
-    """Return a value of a row as a person reads it."""
+    """Return the displayed text of a value."""
     value = row.get(column)
     if value is None:
         return ""
     if column in DECIMALS and not isinstance(value, str):
         return f"{value:,.{DECIMALS[column]}f}"
-    # What a sampler proposes has digits that nobody reads.
+    # Values that a sampler proposes have too many digits.
     is_long_number = re.fullmatch(r"-?\d*\.\d{7,}(e-?\d+)?", str(value))
     return f"{float(value):.6g}" if is_long_number else str(value)
 

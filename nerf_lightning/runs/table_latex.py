@@ -18,7 +18,7 @@ SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
 
 
 def write_latex(rows: list[Row], path: Path, protocol: dict[str, Any]) -> None:
-    r"""Write a table for `\usepackage{booktabs}`; `protocol` is that of the runs, which the caption tells."""
+    r"""Write a table for `\usepackage{booktabs}`; the caption states the runs' `protocol`."""
     shown = {name: cells for name, cells in shown_columns(rows).items() if name not in NOT_IN_PAPERS}
     columns = {
         name: cells for name, cells in shown.items() if name == "model" or len(set(cells)) > 1 or name in HIGHEST
@@ -45,7 +45,7 @@ def write_latex(rows: list[Row], path: Path, protocol: dict[str, Any]) -> None:
 
 
 def for_latex(text: str) -> str:
-    r"""Return a text that LaTeX sets as it is, on one line.
+    r"""Return a text escaped for LaTeX, on one line.
 
     >>> for_latex("a_b & 50% \\ {")
     'a\\_b \\& 50\\% \\textbackslash{} \\{'
@@ -62,7 +62,7 @@ def _with_best_bold(name: str, cells: list[str], rows: list[Row]) -> list[str]:
 
 
 def _caption(shown: dict[str, list[str]], columns: dict[str, list[str]], protocol: dict[str, Any]) -> str:
-    """Return what all rows share, and how their pictures were compared."""
+    """Return what all rows have in common, and how their pictures were compared."""
     same = [f"{name} {cells[0]}" for name, cells in shown.items() if name not in columns and cells[0]]
     told = f"{protocol.get('split', '')} views, {protocol.get('background', '')} background"
     how = [f"PSNR: {protocol['psnr']}"] if "psnr" in protocol and "PSNR" in columns else []

@@ -1,6 +1,6 @@
-"""Rows of a table in a terminal: the columns that fit it, the most telling ones first, and the names of the others.
+"""Rows of a table in a terminal: the columns that fit, the most important ones first, and the names of the others.
 
-Texts in them may come from anybody's run folders: they stay text.
+Texts from untrusted run folders stay text.
 """
 
 import os
@@ -17,22 +17,22 @@ from nerf_lightning.messages.escaping import for_terminal, listed
 from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns
 
 FIRST = ("job", "model", "PSNR", "resolution", "scene")
-"""Columns that are worth most, before the settings by which rows differ."""
+"""The most important columns, before the settings by which rows differ."""
 NEXT = (
     *("state", "time", "steps", "SSIM", "cc PSNR", "seeds", "folder", "LPIPS"),
     *("depth error", "normal error", "parameters", "MB", "frames/s"),
 )
-"""And those that are worth less, in their order."""
+"""The less important columns, in order."""
 WIDE_TEXT = 20  # Longer texts are broken if other columns have no room
 PIPED_WIDTH = 160
 
 
 def print_rows(rows: list[Row], title: str, elsewhere: str) -> None:
-    """Print a table with its title, and below it `elsewhere`: where the columns are that do not fit."""
+    """Print a table with its title, and below it `elsewhere`: where to find columns that do not fit."""
     is_seen = "COLUMNS" in os.environ or sys.stdout.isatty() or sys.stderr.isatty()
     console = StdoutConsole(width=None if is_seen else PIPED_WIDTH)
     shown = shown_columns(rows)
-    shown.pop("source", None)  # a word beside the model says as much
+    shown.pop("source", None)  # a word next to the model says as much
     columns = {_short(name, shown): cells for name, cells in shown.items()}
     if len(set(columns.get("scene", []))) == 1:
         title = f"{title}, scene {columns.pop('scene')[0]}"
@@ -70,7 +70,7 @@ def _table(columns: dict[str, list[str]], rows: list[Row], widest: int | None) -
 
 
 def _short(key: str, others: Iterable[str]) -> str:
-    """Return the shortest end of a dotted key that tells it from the others.
+    """Return the shortest suffix of a dotted key that distinguishes it from the others.
 
     >>> _short("model.fine.sampler.resolution", ["model.fine.sampler.resolution", "resolution"])
     'sampler.resolution'

@@ -32,7 +32,7 @@ from nerf_lightning.training.loggers import WeightsAndBiases
 
 @dataclass
 class TrainJob(Run):
-    """What `nerf train` adds, but for its place on the disk."""
+    """Everything that `nerf train` adds, except its place on disk."""
 
     num_steps: int
     signals: StopSignals
@@ -40,12 +40,12 @@ class TrainJob(Run):
     """One of the callbacks."""
     callbacks: list[Callback]
     loggers: dict[str, Any]
-    """What opens them in the run's folder."""
+    """Factories that open them in the run's folder."""
     post_training: PostTraining
 
 
 def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
-    """Build what a command's config asks for, and read its scene if none is given; nothing is written."""
+    """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
     job = assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
     if job_folder() is not None:
@@ -60,13 +60,13 @@ def assemble_job(
     former: Mapping[str, Any] | None = None,
     scene: Scene | None = None,
 ) -> TrainJob:
-    """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
+    """Build all parts of a `nerf train` run and read its scene; nothing is written.
 
-    What the config leaves open is chosen for the scene; checkpoints keep the choices. `former` is the config of the run
-    that is gone on with, as its folder keeps it; None: it is a new one.
+    What the config leaves open is chosen for the scene; checkpoints keep the choices. `former` is the config of the
+    resumed run, as its folder keeps it; None: a new run.
 
     Raises:
-        InputError: anything in the config or in the capture that makes no run.
+        InputError: the config or the capture does not allow a run.
     """
     settings: TrainerSettings = build(asked.trainer)
     if settings.launched_by == "nerf":
@@ -98,12 +98,12 @@ def assemble_job(
 
 
 def typed_overrides() -> list[str]:
-    """Return what this command's config was composed with: what is left open is composed again with it."""
+    """Return the overrides of this command's config, to compose again what is left open."""
     return [*searchpath_override(), *HydraConfig.get().overrides.task]
 
 
 def searchpath_override() -> list[str]:
-    """Return the override that names folders with yamls of a person's own (`--config-dir`), if there are some."""
+    """Return the override that names folders with the user's own YAMLs (`--config-dir`), if any."""
     hydra = HydraConfig.get()
     named = [source.path for source in hydra.runtime.config_sources if source.provider == "command-line"]
     if named:

@@ -1,4 +1,4 @@
-"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the person."""
+"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the user."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,16 +37,16 @@ MOST_NAMED = 10
 
 @dataclass
 class PostTraining:
-    """What happens after training; built before it, so that bad input shows at once."""
+    """The steps after training; built before it, so that bad input is reported at once."""
 
     scoring: Scoring | None
     path: CameraPath | None
     exports: dict[str, Export]
-    """By name; they write after all that happens here, by the command."""
+    """By name; the command writes them after everything here."""
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "PostTraining":
-        """Build what the config asks for."""
+        """Build what the config specifies."""
         scoring, path = build(config.evaluation), build(config.path)
         if config.final.video:
             require_ffmpeg()
@@ -54,12 +54,12 @@ class PostTraining:
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None, exports)
 
     def require_density(self, model: Model) -> None:
-        """Refuse exports of what a model does not have."""
+        """Refuse exports that need a density if the model has none."""
         if any(export.needs_density for export in self.exports.values()):
             point_field(model)
 
     def require_film(self, scene: Scene) -> None:
-        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory."""
+        """Refuse a path that does not fit around the scene, or frames that do not fit into memory."""
         if self.path is not None:
             record = scene_record(shown_capture(scene))
             require_room(lay_path(self.path, record), FilmSettings())
@@ -103,7 +103,7 @@ class PostTraining:
 
 
 def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:
-    """Return the scene with the cameras that the run has learned, and what a person reads about them."""
+    """Return the scene with the cameras that the run has learned, and the lines of the summary about them."""
     system: Any = trainer.lightning_module
     trained = scene.splits["train"]
     learnt = system.rays.refined(trained)
@@ -123,7 +123,7 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
 
 
 def _film_progress(folder: Path) -> list[str]:
-    """Join the pictures that were taken of one view during training; return the line that says where."""
+    """Join the pictures of one view from training into a film; return the summary line with its path."""
     files = sorted((folder / "images" / "progress").glob("step_*.png"))
     if len(files) < 2:
         return []

@@ -1,4 +1,4 @@
-"""Fit a job's system: precision and tile are settled, the run is announced, and Lightning's Trainer takes the steps."""
+"""Fit a job's system: choose precision and tile, announce the run, and let Lightning's Trainer take the steps."""
 
 import logging
 import shlex
@@ -23,13 +23,13 @@ from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.fastest_tile import SHORT_RUN, measured_tile
 
 LONG = 3600.0
-"""Seconds of training after which a person is told of a shorter way before it starts."""
+"""Seconds of training beyond which a shorter alternative is suggested before it starts."""
 
 log = logging.getLogger(__name__)
 
 
 def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
-    """Train from the beginning, or from where the folder's run stopped, and return the trainer.
+    """Train from the beginning, or from where the run in the folder stopped, and return the trainer.
 
     Raises:
         SystemExit: a signal stopped the training, which was saved (128 + signal).
@@ -48,7 +48,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
     except RuntimeError as error:
         if not is_device_failure(error):
             raise
-        trainer.strategy.checkpoint_io.teardown()  # waits for what is being written, of which the host has a copy
+        trainer.strategy.checkpoint_io.teardown()  # waits for pending writes, of which the host has a copy
         raise InputError(
             f"The GPU has failed after step {trainer.global_step}: {' '.join(str(error).split())[:200]}. "
             f"{_what_is_left(folder)} If it fails again, nerf selftest checks the GPU's results, and trainer=cpu does "
@@ -70,7 +70,7 @@ def _what_is_left(folder: HeldFolder) -> str:
 
 
 def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
-    """Let a run that is gone on with be no shorter than it was to be: its learning rate has followed that length."""
+    """Make a resumed run at least as long as originally planned: its learning rate follows that length."""
     former = folder.former
     if former is not None and job.num_steps < former.num_steps:
         log.warning(
@@ -81,12 +81,12 @@ def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
             job.num_steps,
         )
         job.num_steps = former.num_steps
-    if job.config.budget.seconds is None:  # else the time ends it, and its learning rate has followed that
+    if job.config.budget.seconds is None:  # else the time ends it, and its learning rate follows that
         folder.note(num_steps=job.num_steps)
 
 
 def _prepare(job: TrainJob, folder: HeldFolder) -> None:
-    """Put the model on its device, in the precision and with the tile that suit it, or that the run began with."""
+    """Move the model to its device, with the precision and tile that suit it, or that the run began with."""
     train_step, settings, former = job.system.train_step, job.settings, folder.former
     if former is not None:
         log.info("resuming from step %d of %s", former.step, folder.path)
@@ -95,7 +95,7 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
         train_step.tiles.points = settings.tile_points
     settings.prepare(train_step.objective.model)
     job.system.record["precision"] = settings.precision
-    # A recording takes whole batches.
+    # CUDA graphs record whole batches.
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(train_step)
     if former is None and measures_tile:
         tile, seconds = ranks.from_first(lambda: measured_tile(settings, train_step, job.data.batches))
@@ -110,11 +110,11 @@ def _prepare(job: TrainJob, folder: HeldFolder) -> None:
 
 
 def _announce_hours(job: TrainJob, seconds: float) -> None:
-    """Say how long the steps take that the run, or the publication of its model, asks for, if that is hours.
+    """Log how long the steps of the run, or of its model's publication, will take, if that is hours.
 
     Args:
-        job: what is about to be trained.
-        seconds: about how long a step takes.
+        job: the job to train.
+        seconds: approximate time per step.
     """
     budget = job.config.budget.seconds
     steps, which = (job.num_steps, "") if budget is None else (job.settings.published_steps, ", as published,")
@@ -152,12 +152,12 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
 
 
 def trust_setting(job: TrainJob) -> str:
-    """Return what a command that opens the run's checkpoints needs to build its model, empty if nothing."""
+    """Return the setting that commands need to open the run's checkpoints; empty if none."""
     own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
     return f"trust={own[0] if len(own) == 1 else '[' + ','.join(own) + ']'}" if own else ""
 
 
 def resume_command(folder: Path) -> str:
-    """Return what a person types to go on with a run."""
+    """Return the command that resumes a run."""
     again = to_give_again(HydraConfig.get().overrides.task)
     return " ".join(["nerf train", to_type("resume", str(folder)), *map(shlex.quote, searchpath_override()), *again])

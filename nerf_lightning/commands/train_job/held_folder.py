@@ -1,4 +1,4 @@
-"""The folder of a training: taken by one process for all, held while it trains, and marked with how it ended."""
+"""The folder of a run: taken by one process for all, held during training, and marked with how the run ended."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -28,7 +28,7 @@ class HeldFolder:
 
     path: Path
     former: ResumePoint | None
-    """Where training goes on; None: it begins."""
+    """Where training resumes; None: from the beginning."""
     held: RunFolder | None
     loggers: list[Logger]
 
@@ -38,14 +38,14 @@ class HeldFolder:
             self.held.note(**values)
 
     def trained(self, seconds: float) -> None:
-        """Note how long this start has trained."""
+        """Note how long training took since this start."""
         if self.held is not None:
             self.held.trained(seconds)
 
 
 @contextmanager
 def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
-    """Take the folder of a job, and its log and loggers; note how the run ended, and let the folder go.
+    """Take the folder of a job, and open its log and loggers; note how the run ended, and release the folder.
 
     `asked` is the config before anything was chosen for the scene.
     """
@@ -73,7 +73,7 @@ def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
         raise
     except (InputError, OSError):
         for folder in held:
-            require_run(folder.path)  # where it is gone, whatever failed has failed for that
+            require_run(folder.path)  # if it is gone, that is why anything failed
         raise
     finally:
         for folder in held:
@@ -84,7 +84,7 @@ def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
 def _loggers(job: TrainJob, folder: Path, former: ResumePoint | None) -> Iterator[list[Logger]]:
     purge: dict[str, int] = {}
     if (folder / "tensorboard").exists():
-        # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
+        # Steps logged after the checkpoint will be logged again: tell TensorBoard to purge them.
         purge = {"purge_step": 0 if former is None else former.step + 1}
     started = str(read_note(folder).get("started"))
     with opened_loggers(job.loggers if ranks.is_first() else {}, folder, started, **purge) as loggers:

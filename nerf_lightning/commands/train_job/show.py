@@ -1,4 +1,4 @@
-"""What a person gets to see of a training: Lightning's profile, exports of the scene, the report of the run."""
+"""What the user sees of a run: Lightning's profile, exports of the scene, the report."""
 
 import logging
 import os
@@ -34,12 +34,12 @@ from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 
-ROWS = 15  # Of the profile: the actions that took longest, with all that they called
+ROWS = 15  # Of the profile: the slowest actions, including everything they called
 WIDTH = 54  # Characters of an action's name
 # The path of the film, in ten seconds.
 PATH = {"num_frames": 120, "fps": 12}
 MOST_VIDEO_BYTES = 20_000_000  # Of a film in the page that follows a training
-# Of photographs: 92 steps made 21.6 dB of 16 of them, and 1,018 made 27.8.
+# Of photographs: with 16 of them, 92 steps reached 21.6 dB, and 1,018 steps 27.8.
 FEW_STEPS = 1_000
 RISING = 1.5  # dB of training PSNR in the second half of a run
 MEMORIZED = 6.0  # dB between training and held-out views, beyond which only more photographs help
@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> None:
-    """Close the loggers, and write what the config asks for."""
+    """Close the loggers, and write what the config specifies."""
     for logger in trainer.loggers:
         logger.finalize("success")
     if not ranks.is_first():
@@ -69,13 +69,13 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
 
 
 def _program() -> str:
-    """Return what a person types to start this program: its path where the environment is not activated."""
+    """Return the command that starts this program: its path if the environment is not activated."""
     beside = Path(sys.executable).with_name("nerf")
     return "nerf" if shutil.which("nerf") or not beside.is_file() else os.path.relpath(beside)
 
 
 def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
-    """Return the last line: the page, what came out of the photographs, and what would improve it most."""
+    """Return the last line: the page, the result, and what would improve it most."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
     quality = "" if psnr is None else f"{psnr:.1f} dB on held-out {what}, "
@@ -89,7 +89,7 @@ def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
 
 
 def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> bool:
-    """Return whether more steps would help first: after few of them, or while the error falls fast, of all views."""
+    """Return whether more steps would help most: after few of them, or while the error falls fast in all views."""
     if steps < FEW_STEPS:
         return True
     try:
@@ -104,9 +104,9 @@ def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -
 
 
 def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None:
-    """Export the last checkpoint of a run as `nerf export` does, or say why that cannot be done."""
+    """Export the last checkpoint of a run as `nerf export` does, or log why it cannot be exported."""
     try:
-        # From the file, as nerf export does: what was trained in bfloat16 is read in float32.
+        # From the file, as nerf export does: a model trained in bfloat16 is read in float32.
         checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
         parts = [OmegaConf.to_container(part, resolve=True) for part in (job.config.model, job.config.correction)]
         own = modules_to_trust(parts)
@@ -116,7 +116,7 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
         target = make_folder(folder, "export")
         written = write_files(what, trained, as_known(job.scene, trained), build(path), target)
         say(*(f"{name:<12} {file}" for file in written))
-    except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
+    except Exception as error:  # out of GPU memory, a full disk, a broken compiler: the run is complete all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         log.warning(
             "The run is complete, but final.%s failed: %s nerf export ckpt=%s what=%s writes it later.",
@@ -130,7 +130,7 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
 
 
 def profile_lines(trainer: Trainer) -> list[str]:
-    """Return the lines of the table; none where the simple profiler has not looked."""
+    """Return the lines of the table; none without the simple profiler."""
     profiler = trainer.profiler  # type: ignore[attr-defined]
     if not isinstance(profiler, SimpleProfiler) or not profiler.recorded_durations:
         return []

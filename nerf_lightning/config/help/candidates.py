@@ -1,4 +1,4 @@
-"""What may follow on a command line that somebody is typing: commands, groups, options, settings, values, paths."""
+"""Completions of a partially typed command line: commands, groups, options, settings, values, paths."""
 
 import os
 import re
@@ -10,12 +10,12 @@ from nerf_lightning.files.folders import option_names
 
 SHELLS = ("bash", "zsh", "fish")
 FLAGS = ("--help", "--multirun", "--cfg", "--config-dir", "--hydra-help")
-TAKES_PATHS = ("table", "report")  # Commands to which a folder may be given without a key
+TAKES_PATHS = ("table", "report")  # Commands that accept a folder without a key
 LITERALS = {"bool": ("true", "false"), "null": ("null",)}
 
 
 def candidates(words: list[str], commands: Iterable[str]) -> list[str]:
-    """Return what the last word, which may be empty, may become, as whole words; the first is one of the commands.
+    """Return completions of the last word, which may be empty, as whole words; the first word is a command.
 
     >>> candidates(["train", "model=nerf_s"], ["train"])
     ['model=nerf_small']
@@ -44,7 +44,7 @@ def _possible(before: list[str], current: str, commands: list[str]) -> Iterable[
 
 
 def _keys(asked: Command, current: str, before: list[str]) -> Iterator[str]:
-    """Yield groups and settings, these up to their next dot."""
+    """Yield groups, and settings up to their next dot."""
     chosen = dict(word.split("=", 1) for word in before if "=" in word)
     keys = [f"{group}=" for group in asked.options if len(option_names(group)) > 1]
     for setting in asked.settings:

@@ -1,4 +1,4 @@
-"""What a command can be told: its groups with their options, and all settings, read from conf/ without Hydra."""
+"""A catalog of a command: its groups with their options, and all settings, read from conf/ without Hydra."""
 
 import re
 from collections.abc import Callable
@@ -12,42 +12,42 @@ from nerf_lightning.files.folders import conf_file, option_names
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""
 REQUIRED = "(required)"
-"""Stands for the value of a setting that has none until somebody gives it."""
+"""Placeholder for the value of a setting that the user must provide."""
 TAKES = {"bool": "bool", "int": "int", "float": "float", "seq": "list"}
 
 
 class Setting(NamedTuple):
-    """One setting of one yaml, or a section of settings."""
+    """One setting of a YAML, or a section of settings."""
 
     key: str
     text: str
-    """The value as the yaml has it; empty for a section."""
+    """The value as written in the YAML; empty for a section."""
     takes: str
-    """The type of what may be given."""
+    """The type of its values."""
     meaning: str
-    """The sentence of the docstring, and that of the comment beside it."""
+    """The sentence of the docstring, and that of the comment next to it."""
     source: str
-    """The yaml: an option such as `scene=colmap`, or the command."""
+    """Its YAML: an option such as `scene=colmap`, or the command."""
     is_own: bool
-    """Whether it belongs to that group or command, which may also set those of others."""
+    """Whether it belongs to that group or command, which may also set settings of others."""
 
 
 class Option(NamedTuple):
-    """One yaml of a group."""
+    """One YAML of a group."""
 
     typed: str
     """How it is chosen, such as `scene=colmap`."""
     about: str
-    """The comment at the top of its yaml; without one, the docstring of what it builds."""
+    """The comment at the top of its YAML; without one, the docstring of what it builds."""
     is_global: bool
     settings: list[Setting]
-    """Its own, those of the options that it is based on, and of those that it chooses for its parts."""
+    """Its own settings, those of its base options, and those of the options that it chooses for its parts."""
     chosen: dict[str, str]
     """The options that it chooses in other groups."""
 
 
 class Command:
-    """What one command has. A group is named as it is typed, such as `sampler@model.levels.fine.sampler`."""
+    """Groups and settings of one command. A group is named as typed: `sampler@model.levels.fine.sampler`."""
 
     def __init__(self, name: str, file: CommentedYaml):
         self.name = name
@@ -61,7 +61,7 @@ class Command:
         places = {place(group) for group in self.groups}
         own = {key: entry for key, entry in file.entries.items() if root(key) != "hydra"}
         self.written = _settings(own, f"nerf {name}", lambda key: root(key) not in places)
-        """The settings of its own yaml."""
+        """The settings of its own YAML."""
 
     @cached_property
     def options(self) -> dict[str, list[Option]]:
@@ -72,7 +72,7 @@ class Command:
 
     @cached_property
     def settings(self) -> list[Setting]:
-        """Every setting of its yaml and of all options."""
+        """Every setting of its YAML and of all options."""
         every = (option for options in self.options.values() for option in options)
         return [*self.written, *(setting for option in every for setting in option.settings)]
 
@@ -80,13 +80,13 @@ class Command:
     def chosen(self) -> dict[str, Option]:
         """The options chosen by default."""
         names, found = dict(self.groups), dict[str, Option]()
-        for _ in names:  # what is chosen may choose in its turn
+        for _ in names:  # a chosen option may choose others
             found = {group: read_option(group, name) for group, name in names.items() if name}
             names |= {group: name for each in found.values() for group, name in each.chosen.items() if group in names}
         return found
 
     def default(self, key: str) -> str:
-        """Return the value of a setting if nothing is chosen; if only unchosen options have it, the first one's."""
+        """Return the default value of a setting; if only unchosen options have it, the first one's."""
         in_order = sorted(self.chosen.values(), key=lambda each: not each.is_global)
         candidates = (*self.written, *(setting for each in in_order for setting in each.settings), *self.settings)
         return next(each.text for each in candidates if each.key == key)
@@ -134,7 +134,7 @@ def read_option(group: str, name: str) -> Option:
 
 
 def _merged(file: CommentedYaml, folder: str, prefix: str) -> tuple[dict[str, Entry], dict[str, str]]:
-    """Merge a yaml over the options that it is based on, and collect what all of them choose."""
+    """Merge a YAML over its base options, and collect what all of them choose."""
     entries, chosen = dict[str, Entry](), dict[str, str]()
     for typed, name in file.defaults:
         group, at, package = typed.removeprefix("override ").removeprefix("/").partition("@")
@@ -163,7 +163,7 @@ def _settings(entries: dict[str, Entry], source: str, is_own: Callable[[str], bo
         argument = maker.arguments.get(name) if maker else None
         built = _maker(entries, key)
         documented = argument.meaning if argument else built.summary if built else ""
-        # A table that is one argument, such as scene.download: its sentence is that of all that is in it.
+        # A table that is one argument, such as scene.download: its sentence applies to all its entries.
         texts = [documented, entry.comment] if documented or entry.comment or maker or not parent else [parent.meaning]
         takes = argument.takes if argument else TAKES.get(entry.type, "")
         meaning = " ".join(sentence(text, takes) for text in texts if text)
@@ -173,7 +173,7 @@ def _settings(entries: dict[str, Entry], source: str, is_own: Callable[[str], bo
 
 
 def sentence(text: str, takes: str = "") -> str:
-    """Return a phrase as a sentence; a literal value at its beginning stays as it is.
+    """Return a phrase as a sentence; a literal value at its beginning is unchanged.
 
     >>> sentence("most views; None: all"), sentence("auto takes a GPU", "'auto' | null")
     ('Most views; null: all.', 'auto takes a GPU.')

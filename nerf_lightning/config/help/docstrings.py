@@ -1,4 +1,4 @@
-"""What a class says of its arguments, by its docstring and signature: parsed, since an import would take seconds."""
+"""Documentation of a class's arguments from its docstring and signature: parsed, since an import would take seconds."""
 
 import ast
 import re
@@ -23,7 +23,7 @@ class Argument(NamedTuple):
 
 
 class Constructor(NamedTuple):
-    """A class or function that a yaml names as its `_target_`."""
+    """A class or function that a YAML names as its `_target_`."""
 
     summary: str
     arguments: dict[str, Argument]
@@ -89,7 +89,7 @@ def _signature(lineage: list[tuple[str, Maker]]) -> dict[str, tuple[str, ast.exp
 
 
 def _takes(module: str, annotation: str) -> str:
-    """Return an annotation with the unions that its names stand for."""
+    """Return an annotation with its names replaced by the unions that they stand for."""
 
     def resolved(name: re.Match[str]) -> str:
         origin, node = _find(module, name[0])

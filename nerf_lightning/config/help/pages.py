@@ -1,4 +1,4 @@
-"""What `nerf help` prints: a command, a group, one option of it, a section of settings, or one setting."""
+"""Pages of `nerf help`: a command, a group, one of its options, a section of settings, or one setting."""
 
 import re
 from collections.abc import Iterator
@@ -8,15 +8,15 @@ from nerf_lightning.config.help.catalogue import Command, Option, Setting
 from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
-COLUMN = 34  # Where the sentences of a list begin
+COLUMN = 34  # Start of the sentences in a list
 PLACEHOLDER = re.compile(r"^\$(GROUPS|SETTINGS):(.*)$", re.MULTILINE)
 END = re.compile(r"(?<=\.)\s+(?=[A-Z`*-]|$)|;\s")
 
 
 def command_page(command: Command, width: int) -> str:
-    """Return the short help of a command: the template in its yaml, with its lists filled in.
+    """Return the short help of a command: the template in its YAML, with its lists filled in.
 
-    `$SETTINGS: KEY ...` becomes a line for each key; `$GROUPS: NAME ...` its groups, these with a line per option.
+    `$SETTINGS: KEY ...` becomes a line for each key; `$GROUPS: NAME ...` its groups, with a line per option.
     """
 
     def listed(found: re.Match[str]) -> str:
@@ -78,7 +78,7 @@ def _option_page(option: Option, width: int) -> str:
 
 
 def _setting_page(command: Command, key: str, width: int) -> str:
-    """Return all that is known of a setting; if options mean different things by it, each."""
+    """Return all that is known about a setting; if its meaning differs between options, each meaning."""
     every, default = [each for each in command.settings if each.key == key], command.default(key)
     alike: dict[tuple[str, str], list[Setting]] = {}
     for each in [each for each in every if each.is_own] or every:
@@ -98,7 +98,7 @@ def _described(setting: Setting, width: int) -> str:
 
 
 def row(left: str, right: str, width: int) -> str:
-    """Return a line of a list: a name and, from a column on, what it means."""
+    """Return a line of a list: a name and, from a fixed column on, its meaning."""
     start, indent = f"  {left:<{COLUMN - 3}} ", " " * COLUMN
     if len(start) > COLUMN:
         return f"{start.rstrip()}\n{fill(right, width, initial_indent=indent, subsequent_indent=indent)}"

@@ -1,4 +1,4 @@
-"""What `nerf help WORDS` finds where nothing has that name: symptoms, commands, options and settings."""
+"""Search of `nerf help WORDS` if nothing has that name: symptoms, commands, options and settings."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,11 +9,11 @@ from nerf_lightning.config.help.pages import brief, row
 from nerf_lightning.files.folders import conf_folder
 
 MOST = 20
-"""Commands, options and settings that are listed."""
+"""Maximum number of commands, options and settings listed."""
 
 
 def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str:
-    """Return what all the words, or their beginnings, stand in; empty if there is nothing."""
+    """Return the entries that contain all the words, or their stems; empty if there are none."""
     begun = [re.compile(rf"\b{re.escape(_stem(word))}", re.IGNORECASE) for word in words]
     # Their help begins with `nerf NAME: what it does.`
     texts = {f"nerf {each.name}": each.template.partition(": ")[2].partition("\n\n")[0] for each in commands}
@@ -27,7 +27,7 @@ def search(words: Sequence[str], commands: Sequence[Command], width: int) -> str
 
 
 def _stem(word: str) -> str:
-    """Return how words of one family begin.
+    """Return the common stem of a family of words.
 
     >>> [_stem(word) for word in ("crashed", "films", "latex")]
     ['crash', 'film', 'latex']
@@ -39,7 +39,7 @@ def _stem(word: str) -> str:
 
 
 def _symptoms(begun: list[re.Pattern[str]], width: int) -> Iterator[str]:
-    """Yield what the page of symptoms says below its headings, as far as it fits."""
+    """Yield the matching points of the symptoms page, below their headings."""
     page = (conf_folder().parent / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     bullets = TextWrapper(width, initial_indent="  * ", subsequent_indent="    ")
     for section in page.split("\n## ")[1:]:

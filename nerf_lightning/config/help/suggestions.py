@@ -1,11 +1,11 @@
-"""What somebody may have meant who mistyped a name."""
+"""Suggestions for a mistyped name."""
 
 from collections.abc import Iterable
 from difflib import SequenceMatcher, get_close_matches
 
 
 def near(word: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are most alike: at most three, nearly as alike as the first.
+    """Return the most similar known names: at most three, all nearly as similar as the first.
 
     >>> near("trainer.max_stpes", ["trainer.max_steps", "trainer.max_epochs", "seed"])
     ['trainer.max_steps']
@@ -15,7 +15,7 @@ def near(word: str, known: Iterable[str]) -> list[str]:
 
 
 def did_you_mean(word: str, known: Iterable[str], before: str = "") -> str:
-    """Return the question that follows a complaint, empty where nothing is alike.
+    """Return the question that follows a complaint; empty if nothing is similar.
 
     >>> did_you_mean("fats", ["fast", "nerf"], "model=")
     ' Did you mean model=fast?'

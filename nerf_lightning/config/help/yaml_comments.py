@@ -1,4 +1,4 @@
-"""A yaml file of conf/ with the comments beside its settings, which OmegaConf drops."""
+"""A YAML file of conf/ with the comments next to its settings, which OmegaConf drops."""
 
 import re
 from collections.abc import Iterator
@@ -13,21 +13,21 @@ HEADER = re.compile(r"(?:# @package.*\n)?((?:# (?!@).+\n)+)(?=#?\n|defaults|_|\{
 
 
 class Entry(NamedTuple):
-    """A setting as it is written, or a section of settings."""
+    """A setting as written, or a section of settings."""
 
     text: str
-    """The value as it stands in the file; empty for a section."""
+    """The value as written in the file; empty for a section."""
     type: str
-    """Its yaml type, such as `int`, `bool` or `seq`."""
+    """Its YAML type, such as `int`, `bool` or `seq`."""
     comment: str
-    """The lines above it and the end of its line."""
+    """The comment lines above it and at the end of its line."""
 
 
 class CommentedYaml(NamedTuple):
     """One file."""
 
     entries: dict[str, Entry]
-    """By dotted key, sections before what they hold."""
+    """By dotted key; sections come before their contents."""
     header: str
     """The comment at the top, unless it belongs to the first setting."""
     defaults: list[tuple[str, str | None]]
@@ -38,7 +38,7 @@ class CommentedYaml(NamedTuple):
 
 @cache
 def read_commented(file: Path) -> CommentedYaml:
-    """Read a yaml file together with its comments."""
+    """Read a YAML file together with its comments."""
     text = file.read_text(encoding="utf-8")
     root = yaml.compose(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     sections = root.value if root else []

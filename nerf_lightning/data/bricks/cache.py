@@ -1,4 +1,4 @@
-"""Keep what was rendered: one uncompressed .npz per setting, written whole or not at all."""
+"""Cache rendered pictures: one uncompressed .npz per setting, written atomically."""
 
 import hashlib
 import json
@@ -19,22 +19,22 @@ from nerf_lightning.files.regular import open_own
 from nerf_lightning.messages.errors import InputError
 
 Pictures = UInt8[ndarray, "pixels 4"]
-"""Of all views of a generated scene, one after the other."""
+"""The pixels of all views of a generated scene, concatenated."""
 
 logger = logging.getLogger(__name__)
 
 
 def cache_file(folder: Path, settings: dict[str, int]) -> Path:
-    """Return the file that belongs to settings, the version of the renderer among them."""
+    """Return the cache file for settings, which include the version of the renderer."""
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
     return folder / f"{key}.npz"
 
 
 def cached(path: Path, pixels: int, make: Callable[[], Pictures]) -> Pictures:
-    """Return what `path` holds, a sound file of so many pixels, or make it and keep it there.
+    """Return the content of `path` if it is a valid file of `pixels` pixels; otherwise make and store it.
 
-    Of several processes that ask at once, one makes and the others wait. A damaged file is made again. A folder that
-    cannot be written costs a warning and the time to make it every run, never the run.
+    If several processes call this at once, one makes it and the others wait. A damaged file is made again. If the
+    folder is not writable, warn, and make it in every run.
     """
     try:
         make_own_folder(path.parent)
@@ -51,7 +51,7 @@ def cached(path: Path, pixels: int, make: Callable[[], Pictures]) -> Pictures:
 
 
 def _load(path: Path, pixels: int) -> Pictures | None:
-    """Return a sound file's content, or None."""
+    """Return the content of a valid file, or None."""
     if not path.exists():
         return None
     try:

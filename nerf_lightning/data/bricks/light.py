@@ -1,7 +1,6 @@
-"""From light to color: shadows of the key light, the openness of the surroundings, and what a surface makes of them.
+"""Shading: shadows of the key light, the openness of the surroundings, and the response of a surface.
 
-Shadows and openness are exact whatever the culling: points are sorted into cells, and a cell asks only the parts that
-can matter.
+Culling keeps shadows and openness exact: points are sorted into cells, and a cell tests only the parts that can matter.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,7 @@ from nerf_lightning.data.bricks.solids import Solids
 
 @dataclass(frozen=True)
 class Light:
-    """What shines on a model: a key light, a fill light that casts no shadow, and the surroundings.
+    """The lights of a model: a key light, a fill light that casts no shadow, and the surroundings.
 
     `key` is the unit vector toward the key light; an upward surface receives `sky_light`, a downward one
     `ground_light`. Colors are linear.
@@ -50,7 +49,7 @@ SPREAD = 0.09
 SIDES = 4
 """The key light is a disc of SIDES^2 directions, one for each ray through a pixel."""
 PROBES = (0.025, 0.05, 0.1, 0.18)
-"""Heights over the surface, in world units, at which the room to the next part is asked."""
+"""Heights above the surface, in world units, at which the distance to the nearest part is queried."""
 LIFT = 1e-3
 """Shadow rays start this far above the surface."""
 SHADOW_CELL, PROBE_CELL = 0.12, 0.24
@@ -83,7 +82,7 @@ def key_visible(
     rays: Int[ndarray, "points"],
     light: Light = DAY,
 ) -> Float[ndarray, "points"]:
-    """Return 1 where the key light's direction number `rays` is free, 0 where it is blocked or behind."""
+    """Return 1 where the key light's direction number `rays` is unoccluded, 0 where it is blocked or behind."""
     axes = _key_axes(light)
     directions = _key_directions(axes).astype(points.dtype)[:, rays]
     starts = points + points.dtype.type(LIFT) * normals
@@ -109,9 +108,9 @@ def openness(
     normals: Float[ndarray, "3 points"],
     rays: Int[ndarray, "points"],
 ) -> Float[ndarray, "points"]:
-    """Return the room above each point as a share of the height asked, in [0, 1]; small in corners and gaps.
+    """Return the free space above each point as a share of the queried height, in [0, 1]; small in corners and gaps.
 
-    Each ray through a pixel asks at one height, so that the pixel's mean takes all of them.
+    Each ray through a pixel queries one height, so that the pixel's mean covers all of them.
     """
     step = rays % len(PROBES)
     heights = np.array(PROBES, points.dtype)[step]
@@ -128,14 +127,14 @@ def openness(
 
 
 def cells(places: Float[ndarray, "axes points"], width: float) -> Iterator[Int[ndarray, "members"]]:
-    """Yield the points of each occupied cell of a grid."""
+    """Yield the points in each occupied cell of a grid."""
     if not places.shape[1]:
         return
     grid = np.floor(places / width).astype(np.int32)
     grid -= grid.min(axis=1, keepdims=True)
     shape = grid.max(axis=1) + 1
     flat = np.ravel_multi_index(tuple(grid), tuple(shape))
-    # A short type lets numpy sort by radix, ten times as fast.
+    # A short type lets NumPy use radix sort, ten times as fast.
     flat = flat.astype(np.min_scalar_type(int(np.prod(shape))))
     order = np.argsort(flat, kind="stable")
     yield from np.split(order, np.flatnonzero(flat[order][1:] != flat[order][:-1]) + 1)
@@ -164,12 +163,12 @@ def shade(
 
     Args:
         materials: what `palette` returns.
-        light: what shines on the model.
+        light: the lights of the model.
         part: which part was hit.
         normals: outward, unit length.
-        directions: of the rays that came, unit length.
+        directions: of the incoming rays, unit length.
         lit: share of the key light that arrives.
-        openness: share of the surroundings that is not hidden by nearby parts.
+        openness: share of the surroundings not hidden by nearby parts.
     """
     dtype, (red, green, blue, specular, sharpness, mirror) = normals.dtype, materials[:, part]
     key = _column(light.key, dtype)

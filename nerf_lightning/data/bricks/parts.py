@@ -1,4 +1,4 @@
-"""The parts of a model: a solid, where it stands, and its material; and those of the fire engine.
+"""Parts of a model (a solid, its place and its material), and those of the fire engine.
 
 Lengths are in studs until `scaled`.
 """
@@ -35,7 +35,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Part:
-    """One convex solid in the world: its own numbers (see `shapes`), its middle, and its rotation to the world."""
+    """One convex solid in the world: its size (see `shapes`), its center, and its rotation to the world."""
 
     solid: Solid
     size: tuple[float, ...]
@@ -57,7 +57,7 @@ def block(low: Triple, high: Triple, material: Material) -> Part:
 
 
 def slope(low: Triple, high: Triple, start: tuple[float, float], end: tuple[float, float], material: Material) -> Part:
-    """Return a box cut by the plane through two points (x, z); what lies to the right of start -> end goes."""
+    """Return a box cut by the plane through two points (x, z); what lies to the right of start -> end is removed."""
     size, center = _between(low, high)
     run, rise = end[0] - start[0], end[1] - start[1]
     length = float(np.hypot(run, rise))
@@ -98,7 +98,7 @@ CHROME = Material((0.86, 0.88, 0.92), specular=1.5, sharpness=6, mirror=0.75)
 SCALE = 0.185
 """World units per stud: the model is about as large as the scenes of the Blender set."""
 MIDDLE = (0.0, 0.0, -4.0)
-"""Brings the middle of the model to the origin, in studs."""
+"""Translation of the model's center to the origin, in studs."""
 RISE = np.radians(6.0)
 """How far the ladder is raised."""
 LADDER = np.array([[np.cos(RISE), 0, -np.sin(RISE)], [0, 1, 0], [np.sin(RISE), 0, np.cos(RISE)]])

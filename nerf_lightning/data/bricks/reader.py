@@ -30,22 +30,22 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Sce
 RENDER_VERSION = 1
 """Part of the cache's key: raise it whenever a pixel changes."""
 CHUNK = 3_000_000
-"""Rays that one thread takes at a time: enough to share the search for shadows, few enough for memory."""
+"""Rays per thread at a time: enough to share the search for shadows, few enough for memory."""
 MOST_THREADS = 4
 """Each takes about half a gigabyte."""
 PACKAGED = {"version": RENDER_VERSION, "resolution": 128, "train": 100, "val": 20, "test": 25}
-"""The settings whose pictures are in the package, which saves half a minute: below each other in rows of COLUMNS."""
+"""The settings whose pictures are packaged, which saves half a minute: in a grid with COLUMNS per row."""
 COLUMNS = 5
 MARGIN = 0.02
-"""Room between the model and the box handed out, in world units."""
+"""Margin between the model and its bounding box, in world units."""
 DISTANCE = 4.0311
 """From each camera to the origin, as in the Blender scenes."""
 FIELD_OF_VIEW = 0.6911112070083618
 """Horizontal, in radians, as in the Blender scenes."""
 LOWEST, HIGHEST = 0.05, 0.97
-"""Sine of the elevation: above the horizon, short of the pole, where a picture has no upright."""
+"""Sine of the elevation: above the horizon, and below the pole, where up is undefined."""
 PLASTIC = 1.32471795724474602596
-"""Root of x^3 = x + 1; its powers spread points evenly over a square, however many are taken."""
+"""Root of x^3 = x + 1; its powers spread any number of points evenly over a square."""
 
 
 @dataclass
@@ -57,7 +57,7 @@ class BricksReader(Reader):
         num_train: number of training views, spread over the upper hemisphere.
         num_val: number of validation views, in the gaps between the training views.
         num_test: number of test views, on an orbit.
-        near: distance from a camera at which content begins; the model lies between 2.7 and 5.4.
+        near: distance from a camera at which content begins; the model is between 2.7 and 5.4.
         far: distance at which content ends.
         background: the background of transparent pixels.
         cache_dir: the folder of the rendered images; by default in the user's cache folder (`$NERF_LIGHTNING_CACHE`,
@@ -80,7 +80,7 @@ class BricksReader(Reader):
         return Model(fire_engine(), DAY)
 
     def model_key(self) -> dict[str, int]:
-        """Return what tells this model from others in the cache."""
+        """Return what distinguishes this model from others in the cache."""
         return {}
 
     def read(self) -> Scene:
@@ -137,13 +137,13 @@ class BricksReader(Reader):
 
 @dataclass(frozen=True)
 class ExactGeometry:
-    """Depth and normals of a view, traced when they are asked for."""
+    """Depth and normals of a view, traced on demand."""
 
     cameras: Cameras
     model: Model
 
     def __call__(self, view: int) -> Truth:
-        """Return those through the centers of a view's pixels."""
+        """Return depth and normals at the centers of a view's pixels."""
         depth, normals = Tracer(self.model.parts, self.model.light).geometry(_pinhole(self.cameras, view))
         return Truth(torch.from_numpy(depth), torch.from_numpy(normals))
 
@@ -176,7 +176,7 @@ def bricks_cameras(train: int, val: int, test: int, resolution: int) -> Cameras:
     """Return square views: train first, then val, then test.
 
     Train and val are successive points of one additive recurrence on the upper hemisphere, so val lies in the gaps of
-    train. Test goes once around, rising and sinking twice, between 14 and 46 degrees of elevation.
+    train. Test orbits once, rising and falling twice, between 14 and 46 degrees of elevation.
     """
     index = torch.arange(train + val, dtype=torch.float64)
     sphere = _on_sphere((0.5 + index / PLASTIC) % 1, LOWEST + (HIGHEST - LOWEST) * ((0.5 + index / PLASTIC**2) % 1))

@@ -2,7 +2,7 @@
 
 A ray is inside a convex solid between two distances, so every solid here is an intersection of intervals. All
 functions broadcast: axis 0 of `origin`, `direction` (of unit length) and `point` is x, y, z; axis 0 of `size` is the
-solid's numbers.
+solid's parameters.
 
 | solid    | size                                                                        |
 |----------|-----------------------------------------------------------------------------|
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 TINY = 1e-12
-"""Stands in for a zero component of a direction, so that a slab's distances are huge instead of undefined."""
+"""Replaces a zero component of a direction, so that a slab's distances are huge instead of undefined."""
 
 Vectors = Float[ndarray, "3 ..."]
 Numbers = Float[ndarray, "..."]
@@ -29,7 +29,7 @@ Interval = tuple[Numbers, Numbers]
 
 
 class Solid(NamedTuple):
-    """What the tracer asks of a kind of solid."""
+    """The functions that the tracer needs for a kind of solid."""
 
     interval: Callable[[Vectors, Vectors, Sizes], Interval]
     """(origin, direction, size) -> distances of entry and exit; a miss has entry > exit."""
@@ -46,9 +46,9 @@ def _nonzero(values: Numbers) -> Numbers:
 
 
 def _slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interval:
-    """Return between which distances a line is within `half` of 0 along one axis (Kay and Kajiya, SIGGRAPH 1986).
+    """Return the interval in which a line is within `half` of 0 along one axis (Kay and Kajiya, SIGGRAPH 1986).
 
-    Where the line runs along the slab, they are huge: both of one sign outside of it, of two signs inside.
+    If the line is parallel to the slab, its ends are huge: of the same sign outside the slab, of opposite signs inside.
     """
     inverse = 1 / _nonzero(direction)
     middle, reach = -origin * inverse, half * np.abs(inverse)

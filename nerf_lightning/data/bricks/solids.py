@@ -1,7 +1,7 @@
-"""Many parts at once: the first hit of a ray, whether light is blocked, how much room there is around a point.
+"""Many parts at once: the first hit of a ray, whether light is blocked, the free space around a point.
 
-Parts that share a kind of solid and a frame form a group: rays go into the frame once, then meet all its parts
-in one broadcast of (parts, rays). The caller passes few enough rays that these tables stay in the cache.
+Parts that share a kind of solid and a frame form a group: rays are transformed into the frame once, then intersect all
+its parts in one broadcast of (parts, rays). The caller passes few enough rays that these tables fit into the cache.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Group:
         return Group(self.solid, self.frame, self.center[:, keep], self.size[:, keep], self.number[keep])
 
     def local(self, points: Float[ndarray, "3 rays"]) -> Float[ndarray, "3 parts rays"]:
-        """Return points as each part sees them."""
+        """Return points relative to each part."""
         return (self.frame.T @ points)[:, None] - self.center[:, :, None]
 
     def interval(self, origins: Vectors, directions: Vectors) -> Interval:
@@ -103,7 +103,7 @@ class Solids:
     def blocked(
         self, origins: Float[ndarray, "3 rays"], directions: Float[ndarray, "3 #rays"]
     ) -> Bool[ndarray, "rays"]:
-        """Tell the rays that meet a part anywhere."""
+        """Return which rays hit a part anywhere."""
         found = np.zeros(origins.shape[1], bool)
         for group in self.groups:
             entry, exit = group.interval(origins, directions)

@@ -1,4 +1,4 @@
-"""From cameras to pixels: trace tiles of the picture against the parts that can appear in them."""
+"""Trace tiles of a picture against the parts that can appear in them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from nerf_lightning.data.bricks.parts import Part
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 
 TILE = 16
-"""Pixels along a tile's side, twice as many with one ray a pixel: few candidates per ray, yet enough rays per call."""
+"""Side of a tile in pixels, doubled with one ray per pixel: few candidates per ray, yet enough rays per call."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Pinhole:
     resolution: int
 
     def directions(self, x: Float[ndarray, "rays"], y: Float[ndarray, "rays"]) -> Float[ndarray, "3 rays"]:
-        """Return unit rays through places of the picture, in pixels from the upper left corner."""
+        """Return unit rays through points of the picture, in pixels from the upper left corner."""
         middle = self.resolution / 2
         local = np.stack([(x - middle) / self.focal, (middle - y) / self.focal, -np.ones_like(x)])
         world = self.c2w[:, :3] @ local
@@ -60,8 +60,8 @@ class Tracer:
     def pictures(self, views: Sequence[Pinhole]) -> UInt8[ndarray, "views pixels 4"]:
         """Return straight RGBA: alpha is the share of a pixel's 4 x 4 rays that hit, color the mean of those hits.
 
-        The mean is taken over sRGB codes, because that is how radiance fields and viewers blend them. Views of one
-        call share the search for shadows, which is faster and changes no value; they have one resolution.
+        The mean is taken over sRGB codes, because that is how radiance fields and viewers blend them. Views of one call
+        share the search for shadows, which is faster and changes no value; they have the same resolution.
         """
         pixels = views[0].resolution ** 2
         each = [self.find(view, SIDES, self.fast) for view in views]
@@ -102,9 +102,9 @@ class Tracer:
     def _openness(
         self, found: Found, normals: Float[ndarray, "3 hits"], pixel: Int[ndarray, "hits"]
     ) -> Float[ndarray, "hits"]:
-        """Return each pixel's mean openness, for it varies slowly: asked on the diagonal of the 4 x 4 rays.
+        """Return each pixel's mean openness, queried only on the diagonal of the 4 x 4 rays, as it varies slowly.
 
-        Where nothing on the diagonal hits, every ray of the pixel is asked.
+        If no ray on the diagonal hits, every ray of the pixel is queried.
         """
         asked = found.ray % (SIDES + 1) == 0
         asked |= np.bincount(pixel, asked)[pixel] == 0

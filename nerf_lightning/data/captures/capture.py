@@ -1,4 +1,4 @@
-"""What a format says of a capture, before any pixel is read: views with poses and intrinsics, sparse points, splits."""
+"""The content of a capture before any pixel is read: views with poses and intrinsics, sparse points, splits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -15,19 +15,19 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import LensModel
 
 SINGLE: tuple[LensModel, ...] = ("fisheye", "equirectangular")
-"""Lenses that no other kind holds."""
+"""Lens models that cannot be expressed by another."""
 MOST_ODD = 0.25
-"""Of the views may have another kind of lens than the others, and are left out."""
+"""Maximum share of views that are left out because their kind of lens differs from the others'."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph with its camera, as the format gives them."""
+    """One photograph with its camera, as given by the format."""
 
     name: str
     photograph: Photograph
     c2w: Float[Tensor, "3 4"]
-    """Camera to the user's world; right, up, back, center; float64."""
+    """Camera to the user's world: right, up, back, center; float64."""
     focal: tuple[float, float]
     """In pixels of `size`."""
     center: tuple[float, float]
@@ -36,9 +36,9 @@ class View:
     lens: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, k3, k4, p1, p2."""
     depth: Path | None = None
-    """A gray picture of 16 bits, or an array of numpy's (.npy), of depths along the camera's axis; 0 is unknown."""
+    """A 16-bit gray picture or a NumPy array (.npy) of depths along the camera's axis; 0 is unknown."""
     depth_unit: float | None = None
-    """How long a unit of `depth` is, in units of the capture; None: see `known_depths.depths_of_maps`."""
+    """Length of a unit of `depth`, in units of the capture; None: see `known_depths.depths_of_maps`."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,21 @@ class Capture:
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
     """Sparse points of the reconstruction."""
     point_errors: Float[Tensor, "known"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    """Mean distance in pixels between where a point was seen and where it projects to; empty without `tracks`."""
+    """Mean reprojection error of each point in pixels; empty without `tracks`."""
     tracks: Int[Tensor, "seen 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.int64))
-    """Which point was seen in which view, where the format says so."""
+    """Which point was seen in which view, if the format says so."""
     bounds: Float[Tensor, "views 2"] | None = None
-    """Nearest and farthest depth of content, where the format has them."""
+    """Nearest and farthest depth of content, if the format has them."""
     box: Float[Tensor, "2 3"] | None = None
-    """Lower and upper corner of the box that holds the content, where the format has one."""
+    """Lower and upper corner of the content's bounding box, if the format has one."""
     splits: dict[str, tuple[int, ...]] | None = None
-    """Where the format names them."""
+    """If the format names them."""
     undo: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
-    """Takes the poses' frame to the frame that the capture's maker knows."""
+    """Transforms the poses' frame into the frame of the capture's author."""
     left_out: LeftOut = field(default_factory=lambda: LeftOut(""))
     """Views that cannot be used, and photographs that have no pose."""
     depth_unit: float = 1e-3
-    """How long a level of the views' depth maps is, in units of the capture; sensors count millimeters."""
+    """Length of a level of the views' depth maps, in units of the capture; sensors count millimeters."""
 
     def some(self, kept: Sequence[int]) -> "Capture":
         """Return some of the views, in order; the splits follow."""
@@ -100,9 +100,9 @@ class Capture:
 
 
 def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
-    """Return the model that holds all of these lenses, a scene having one; None where none does.
+    """Return the lens model, of which a scene has one, that can express all of these; None if there is none.
 
-    A lens without distortion is one with coefficients of 0; fisheyes and panoramas stand alone.
+    A lens without distortion has coefficients of 0; fisheyes and panoramas cannot be combined with others.
 
     >>> common_lens_model({"pinhole", "radial_tangential"}), common_lens_model({"pinhole", "fisheye"})
     ('radial_tangential', None)
@@ -115,12 +115,12 @@ def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
 
 
 def of_one_lens(capture: Capture, kinds: Sequence[LensModel]) -> Capture:
-    """Return a capture with the lens model that holds those of all views (`kinds`), or of all but a few.
+    """Return a capture with the lens model that can express those of all views (`kinds`), or of all but a few.
 
-    A scene has one kind of lens. Up to a quarter of the views, which have another one, are left out.
+    A scene has one kind of lens. Up to a quarter of the views are left out if they have another one.
 
     Raises:
-        InputError: no kind is that of most views.
+        InputError: no kind of lens suits enough views.
     """
     groups = [{kind for kind in kinds if kind not in SINGLE}, *({kind} for kind in SINGLE)]
     usual = max(groups, key=lambda group: sum(kind in group for kind in kinds))

@@ -1,4 +1,4 @@
-"""What is judged: the numbers of a capture, whatever format they were read from, and the settings of scenes."""
+"""Validate the numbers of a capture, whatever its format, and the settings of scenes."""
 
 import logging
 import math
@@ -21,16 +21,16 @@ from nerf_lightning.nerf.geometry.world_frame import LARGEST_UNIT, LEAST_UNIT, u
 from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, SceneRecord
 
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
-"""What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
-have not lost every digit that a picture could show."""
+"""Limits of a camera: its minimum focal length in pixels, and its largest coordinates (in the capture's units, and in
+the scene's) that have not lost every digit that a picture could show."""
 LEAST_SCALE, ALMOST_ONE = 1e-6, 4e-4
-"""Of a rotation's scale: less is none, and so near to 1 it is rounding."""
+"""Of a rotation's scale: below the first it is invalid, and within the second of 1 it is rounding."""
 ROUNDED = 1e-4
-"""Of rotations, and of how far cameras stand from their middle: poses that differ less are one pose."""
+"""Of rotations, and of the cameras' distance from their center: poses that differ less are the same."""
 SMALL = 16
-"""Pixels of a side, up to which a principal point may be as near to the corner as 1."""
+"""Side in pixels, up to which a principal point may be as near to the corner as 1."""
 WIDEST = 170.0
-"""Degrees across a picture, beyond which nothing was photographed through a perspective lens."""
+"""Maximum field of view of a perspective lens in degrees."""
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +38,7 @@ log = logging.getLogger(__name__)
 def usable(capture: Capture) -> Capture:
     """Return the capture without the views, points and depths that cannot be used.
 
-    A rotation that is scaled alike along all axes loses its scale; of two views of one picture the first one counts,
-    where they agree.
+    The scale of uniformly scaled rotations is removed; of two views of one picture the first one counts, if they agree.
 
     Raises:
         InputError: too few views remain.
@@ -62,7 +61,7 @@ def usable(capture: Capture) -> Capture:
     kept = []
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
-            # Those that are left out are shown, and nothing is called by them.
+            # Names that are left out are only shown.
             require_printable(view.name, f"A photograph of {capture.source}")
             if fault := _fault_of(view, capture.lens_model):
                 raise InputError(f"{capture.source}: the view {view.name} {fault}")
@@ -83,7 +82,7 @@ def usable(capture: Capture) -> Capture:
 
 
 def cameras_as_given(capture: Capture) -> Cameras:
-    """Return the cameras of a capture as its format gives them (float64), at the sizes that they hold for."""
+    """Return the cameras of a capture as given by its format (float64), at the sizes that they are valid for."""
 
     def column(name: str) -> Tensor:
         return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
@@ -113,13 +112,13 @@ def _with_sound_lenses(capture: Capture) -> Capture:
 
 
 def _almost_alike(one: Float[Tensor, "3 4"], other: Float[Tensor, "3 4"], reach: float) -> bool:
-    """Return whether two poses differ by rounding alone; `reach` is how far cameras stand from their middle."""
+    """Return whether two poses differ only by rounding; `reach` is the cameras' distance from their center."""
     off = (one - other).abs()
     return float(off[:, :3].max()) <= ROUNDED and float(off[:, 3].max()) <= ROUNDED * reach
 
 
 def _without_scale(view: View) -> tuple[View, float | None]:
-    """Return the view with a rotation in place of a multiple of one, and the factor; None where there was none."""
+    """Return the view with its rotation's scale removed, and the scale; None if there was none."""
     determinant = float(torch.linalg.det(view.c2w[:, :3])) if bool(torch.isfinite(view.c2w).all()) else 0.0
     scale = max(determinant, 0.0) ** (1 / 3)
     if scale < LEAST_SCALE or abs(scale - 1.0) < ALMOST_ONE:
@@ -129,7 +128,7 @@ def _without_scale(view: View) -> tuple[View, float | None]:
 
 
 def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | float, int | float]) -> str | None:
-    """Say why no perspective lens takes a picture of this size (width, height) at these focal lengths; None: some does.
+    """Return why no perspective lens has this picture size (width, height) and these focal lengths; None if one does.
 
     >>> impossible_lens((800, 600), (400, 400))
     >>> impossible_lens((800, 600), (0.5, 0.5))
@@ -145,7 +144,7 @@ def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | fl
 
 
 def _fault_of(view: View, lens_model: LensModel) -> str | None:
-    """Return why the numbers of a view make no camera, with the cure."""
+    """Return why the numbers of a view are not a valid camera, with the cure; None if they are."""
     (width, height), (x, y), center = view.size, view.focal, view.center
     numbers = torch.tensor([*view.focal, *center, *view.size, *view.lens], dtype=torch.float64)
     if not bool(torch.isfinite(numbers).all() and torch.isfinite(view.c2w).all()):
@@ -182,7 +181,7 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
 
 
 def _with_known_depths(capture: Capture) -> Capture:
-    """Return the capture without sparse points that are mistakes, and without bounds where one of them is."""
+    """Return the capture without wrong sparse points, and without bounds if one of them is wrong."""
     sound = (capture.points.abs() <= FARTHEST).all(dim=-1)  # not NaN
     if not bool(sound.all()):
         count = int((~sound).sum())
@@ -206,13 +205,13 @@ def _with_known_depths(capture: Capture) -> Capture:
 
 
 def check_step(name: str, value: object) -> None:
-    """Refuse a factor or stride below 1, or one that is no whole number; `name` is that of the setting."""
+    """Refuse a factor or stride that is below 1 or not a whole number; `name` is the setting's."""
     if type(value) is not int or value < 1:
         raise InputError(f"scene.{name} is {value}, but it must be 1 (take everything as it is) or more.")
 
 
 def check_metres(metres_per_unit: float | None) -> None:
-    """Refuse a unit of no length, or beyond all digits."""
+    """Refuse a unit without length, or beyond numerical range."""
     if metres_per_unit is not None and not LEAST_UNIT <= metres_per_unit <= LARGEST_UNIT:
         raise InputError(
             f"scene.metres_per_unit={metres_per_unit}: give the length of one unit of the capture in meters, such as "
@@ -221,7 +220,7 @@ def check_metres(metres_per_unit: float | None) -> None:
 
 
 def known_background(name: str) -> Background:
-    """Return `name` as a background, or refuse one that there is none of."""
+    """Return `name` as a background, or refuse an unknown one."""
     for known in get_args(Background):
         if name == known:
             return known
@@ -229,9 +228,9 @@ def known_background(name: str) -> Background:
 
 
 def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
-    """Return 3 x 4 or 4 x 4 numbers, nested or in a row, as a pose (float64); a last row must be 0 0 0 1.
+    """Return 3 x 4 or 4 x 4 numbers, nested or flat, as a pose (float64); a fourth row must be 0 0 0 1.
 
-    A matrix whose last column is 0 0 0 1 is written column by column.
+    A matrix whose last column is 0 0 0 1 is in column-major order.
     """
     try:
         pose = torch.as_tensor(matrix, dtype=torch.float64)
@@ -259,15 +258,15 @@ def _alike(row: Tensor, wanted: Tensor) -> bool:
 
 
 def check_scene(scene: SceneRecord, where: str) -> None:
-    """Refuse numbers that are no scene's, whether a reader or a checkpoint says them; warn of splits that overlap.
+    """Refuse numbers that are not a valid scene, from a reader or a checkpoint; warn about overlapping splits.
 
     Args:
         scene: of annotated shapes and kinds, and finite.
         where: the file, for messages.
 
     Raises:
-        Mismatch: cameras that are none, content that ends before it begins, a box without inside, a frame that is no
-            similarity, or views that are not there.
+        Mismatch: invalid cameras, content that ends before it begins, an empty box, a frame that is not a similarity,
+            or missing views.
         InputError: more than the budgets allow, or a name that cannot be shown.
     """
     names, views = scene.view_names, len(scene.view_names)
@@ -314,10 +313,10 @@ def _warn_of_overlap(where: str, names: tuple[str, ...], of: int) -> None:
 
 
 def check_cameras(cameras: Cameras, place: str, where: str) -> None:
-    """Refuse numbers that are no cameras; see `check_scene`.
+    """Refuse numbers that are not valid cameras; see `check_scene`.
 
     Raises:
-        Mismatch: a pose that is no rotation with a center, or a size or a lens that none has.
+        Mismatch: a pose that is not a rotation and a center, or an impossible size or lens.
         InputError: a picture of more than `budgets.view_pixels`.
     """
     if not bool(is_rigid(cameras.c2w).all()):

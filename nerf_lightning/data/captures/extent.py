@@ -1,4 +1,4 @@
-"""How much of space is modeled, the working frame of a capture, and where along its rays content may lie."""
+"""The space that is modeled, the working frame of a capture, and the extent of content along its rays."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -29,26 +29,26 @@ from nerf_lightning.nerf.geometry.world_frame import (
 )
 from nerf_lightning.nerf.types.scene import Cameras, Space
 
-# The near plane lies at this share of the least depth (LLFF's bound factor).
+# The near plane is at this share of the minimum depth (LLFF's bound factor).
 NEAR_SHARE = 0.75
-# Sparse points beyond these quantiles of the depths in a picture are taken for mistakes; fewer points tell nothing.
+# Sparse points beyond these quantiles of the depths in a picture are treated as mistakes; fewer points say nothing.
 QUANTILES, FEWEST_POINTS = (0.01, 0.99), 20
-# Of more sparse points an even part is looked at in each view.
+# If there are more sparse points, an evenly spaced subset is used for each view.
 MOST_POINTS = 20_000
-# Of those quantiles: content may begin before the nearest point, and go on behind the farthest.
+# Factors of those quantiles: content may begin before the nearest point, and continue behind the farthest.
 NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
-# Room around the sparse points on each side of their box, as a share of it.
+# Margin around the sparse points on each side of their box, as a share of it.
 BOX_MARGIN = 0.1
-# Times the median camera's distance from the middle: one that is farther away is a mistake of the reconstruction.
+# Times the median camera's distance from the center: a camera that is farther away is a reconstruction mistake.
 FARTHEST_CAMERA = 3.0
-# Without sparse points, in units of the farthest camera's distance from the middle.
+# Without sparse points, in units of the farthest camera's distance from the center.
 NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
-# Cameras that stand closer together than this share of their coordinates, which may be a map's, stand at one place.
+# Cameras closer together than this share of their coordinates, which may be a map's, are at the same place.
 ONE_PLACE = 1e-9
-# Of the cube that the ball of the cameras just holds.
+# Of the cube inscribed in the cameras' ball.
 UNIT_BALL_HALF = 3**-0.5
-# The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
-# normalized device coordinates.
+# Minimum cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in normalized
+# device coordinates.
 LEAST_AHEAD = 0.1
 
 
@@ -59,7 +59,7 @@ def choose_space(
     has_transparency: bool,
     near: float | None = None,
 ) -> tuple[Space, str]:
-    """Return the space, and why; NDC is refused where it cannot work. `near` is as for `extent_of`."""
+    """Return the space and the reason; refuse NDC if it cannot work. `near` is as for `extent_of`."""
     cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
     if asked == "ndc" and not ahead:
         raise InputError(
@@ -86,7 +86,7 @@ def choose_space(
 
 
 def least_ahead(cameras: Cameras) -> float:
-    """Return the least cosine between a pixel's ray and the cameras' mean direction, over a coarse grid of pixels."""
+    """Return the minimum cosine between a pixel's ray and the cameras' mean direction, over a coarse grid of pixels."""
     cameras = replace(cameras, c2w=cameras.c2w.float())
     zeros = torch.zeros(cameras.c2w.shape[0])
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
@@ -95,7 +95,7 @@ def least_ahead(cameras: Cameras) -> float:
 
 @dataclass(frozen=True)
 class Extent:
-    """Where content may lie."""
+    """Where content may be."""
 
     to_user: Float[Tensor, "4 4"]
     """The working frame, float64."""
@@ -108,8 +108,8 @@ class Extent:
 def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | None, far: float | None) -> Extent:
     """Return the frame and the extent that suit a space.
 
-    Capture and cameras (at the size of the pixels) are in the user's frame, `near` and `far` in the user's units, where
-    the user knows better.
+    Capture and cameras (at the size of the pixels) are in the user's frame; `near` and `far` are overrides in the
+    user's units.
 
     Raises:
         InputError: all cameras are at one position, near and far leave nothing, or the space does not suit the cameras.
@@ -118,7 +118,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     if space == "ndc":
         return _forward_facing(capture, cameras, near, far)
     focus = middle_of_cameras(cameras)
-    # The farthest camera stands at distance 1, but for those that have drifted away.
+    # The farthest camera is at distance 1, except for those that have drifted away.
     distance = (cameras.c2w[:, :, 3] - focus).norm(dim=-1)
     unit = float(torch.minimum(distance.max(), FARTHEST_CAMERA * distance.median()))
     to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)
@@ -127,7 +127,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     if space == "bounded":
         aabb = _box(capture, cameras, to_user)
         nearest, farthest = _around_box(cameras, to_user, aabb, nearest)
-    # What was found yields to what the user says.
+    # The user's values take precedence.
     if far is not None:
         farthest = torch.full_like(farthest, far / unit)
     nearest = torch.full_like(nearest, near / unit) if near is not None else torch.minimum(nearest, 0.5 * farthest)
@@ -140,10 +140,10 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
 
 
 def given_extent(capture: Capture, near: float | None, far: float | None, aabb_half: float | None) -> Extent:
-    """Return what files and settings give, in the capture's own frame.
+    """Return the extent given by files and settings, in the capture's own frame.
 
     Raises:
-        InputError: near, far or the box is given nowhere.
+        InputError: near, far or the box is not given.
     """
     box = capture.box if aabb_half is None else _cube(aabb_half)
     if near is None or far is None or box is None:
@@ -158,12 +158,12 @@ def given_extent(capture: Capture, near: float | None, far: float | None, aabb_h
 
 
 def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Capture) -> None:
-    """Refuse an extent that no checkpoint could keep: it follows from numbers of the capture that are mistakes.
+    """Refuse an extent that no checkpoint could store, which results from wrong numbers in the capture.
 
-    `to_user` leads from the working frame to the frame that the capture's maker knows.
+    `to_user` transforms the working frame into the frame of the capture's author.
 
     Raises:
-        InputError: content reaches beyond all digits, its box has no inside, or the frame's unit is none.
+        InputError: content exceeds the numerical range, its box is empty, or the frame's unit is invalid.
     """
     reach = torch.cat([extent.near, extent.far, extent.aabb.flatten()]).abs().max()
     if not float(reach) <= FARTHEST:  # NaN, too
@@ -186,7 +186,7 @@ def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Cap
 
 
 def depths_of(capture: Capture, cameras: Cameras, view: int) -> Float[Tensor, "points"]:
-    """Return how far in front of a view the sparse points lie that fall into its picture, in the user's units."""
+    """Return the depths of the sparse points in a view's picture, in the user's units."""
     c2w = cameras.c2w[view]
     points = capture.points[:: 1 + len(capture.points) // MOST_POINTS]
     local = (points - c2w[:, 3]) @ c2w[:, :3]
@@ -212,7 +212,7 @@ def _cube(half: float) -> Float[Tensor, "2 3"]:
 
 
 def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[Tensor, Tensor]:
-    # Distances of content per view, in scene units: from the sparse points where they are, else a guess that is wide.
+    # Distances of content per view, in scene units: from the sparse points if there are any, else a wide guess.
     unit, views = unit_of(to_user), len(capture.views)
     near = torch.full((views,), NEAR_BLIND, dtype=torch.float64)
     far = torch.full((views,), FAR_CONTRACTED, dtype=torch.float64)
@@ -227,20 +227,20 @@ def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[T
 
 
 def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "2 3"]:
-    """Return the box that the format names, or that holds the sparse points, or that the cameras have in view."""
+    """Return the box that the format names, or the sparse points' bounding box, or what the cameras see."""
     if capture.box is not None:
         corners = points_from_user(torch.cartesian_prod(*capture.box.mT), to_user)
         return torch.stack([corners.amin(dim=0), corners.amax(dim=0)]).float()
     if len(capture.points) >= FEWEST_POINTS:
         points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
-        # Alike toward all sides, so that it does not depend on where the user's x axis points.
+        # Symmetric, so that it does not depend on the direction of the user's x axis.
         level = (1.0 + BOX_MARGIN) * torch.quantile(points[:, :2].norm(dim=-1), QUANTILES[1])
         low, high = torch.quantile(points[:, 2], points.new_tensor(QUANTILES))
         room = BOX_MARGIN * (high - low)
         return torch.stack(
             [torch.stack([-level, -level, low - room]), torch.stack([level, level, high + room])]
         ).float()
-    # A ball around the middle that fills the longer side of the closest picture.
+    # A ball around the center that fills the longer side of the closest picture.
     distance = poses_from_user(cameras.c2w, to_user)[:, :, 3].norm(dim=-1)
     half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
     tangent = (half_size / cameras.focal).amax(dim=-1).double()
@@ -256,7 +256,7 @@ def _around_box(cameras: Cameras, to_user: Tensor, aabb: Tensor, near: Tensor) -
 
 
 def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far: float | None) -> Extent:
-    # LLFF's frame: the average camera looks along -z; the unit is such that the near plane lies at z = -1.
+    # LLFF's frame: the average camera looks along -z; the unit is such that the near plane is at z = -1.
     if far is not None:
         raise InputError(
             f"scene.far={far:g} cannot be used with scene.space=ndc, which reaches to infinity. Leave it out, or use "
@@ -277,7 +277,7 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far:
 
 
 def _near_plane(capture: Capture, cameras: Cameras, near: float | None) -> float:
-    """Return how far before the cameras' middle the near plane of NDC lies; refuse one that a camera stands behind."""
+    """Return the distance from the cameras' center to the near plane of NDC; refuse one that a camera is behind."""
     mean = average_pose(cameras.c2w)
     plane = near
     if plane is None:
@@ -301,7 +301,7 @@ def _near_plane(capture: Capture, cameras: Cameras, near: float | None) -> float
 
 
 def _nearest_depth(capture: Capture, cameras: Cameras) -> float | None:
-    """Return the depth at which content begins, as bounds or sparse points say; None where neither does."""
+    """Return the depth at which content begins, from bounds or sparse points; None if there are neither."""
     if capture.bounds is not None:
         return float(capture.bounds.min())
     depths = [depths_of(capture, cameras, view) for view in range(len(capture.views))]
@@ -310,7 +310,7 @@ def _nearest_depth(capture: Capture, cameras: Cameras) -> float | None:
 
 
 def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor, ""]]:
-    # Where the rays of all pictures begin and end in the cube, and the longest way between.
+    # Where the rays of all pictures begin and end in the cube, and the longest distance between.
     zeros = torch.zeros(cameras.c2w.shape[0])
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros + 1.0).map(lambda x: x.flatten(0, 1))
     return torch.cat([rays.origins, rays.origins + rays.far[:, None] * rays.directions]), rays.far.max()

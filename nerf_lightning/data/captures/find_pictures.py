@@ -1,8 +1,8 @@
-"""Which file a capture means by the name of a picture: one rule for all of its names, whoever wrote them and where.
+"""Find the files of a capture's picture names: one rule for all names of a file.
 
-Files name pictures by absolute paths of another machine, from their parent's folder, with backslashes, or with another
-ending than what is there. All names of a file are changed in the same way: so many folders are dropped at their
-beginning, and the rest lies in one folder of the capture.
+Files name pictures by absolute paths of another machine, relative to their parent's folder, with backslashes, or with
+another extension than the actual one. All names of a file are changed in the same way: a number of leading folders is
+dropped, and the rest is in one folder of the capture.
 """
 
 import logging
@@ -22,7 +22,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 PICTURE_FOLDERS = ("images", "image", "rgb", "input", "", "images_2", "images_4", "images_8")
-"""Where photographs lie below a capture's folder, the likeliest first."""
+"""Folders of photographs below a capture's folder, the likeliest first."""
 JPEG = (".jpg", ".jpeg")
 KNOWN_ENDINGS = (*ENDINGS, *UNREAD, ".bmp")
 NOT_READ = (
@@ -41,14 +41,14 @@ NOT_READ = (
     ".mov",
     ".zip",
 )
-"""Endings under which a picture may lie that is not read."""
+"""Extensions of pictures that are not read."""
 CONVERT = "Files of this format are not read: convert all of them to PNG."
 SPLIT_FOLDERS = ("train", "val", "test", "eval")
-"""Names that tell pictures apart which are called alike: they are never dropped, nor taken for each other."""
+"""Names that distinguish pictures of the same name: they are never dropped or exchanged."""
 BESIDE_PHOTOGRAPHS = re.compile(r"(masks?|depths?|normals?|segmentations?|semantics?|confidence)(_.*)?")
-"""Folders of pictures that are no photographs."""
+"""Folders of pictures that are not photographs."""
 MASK_ENDING = re.compile(r"[._-]masks?$")
-"""What a mask's name may have and its photograph's has not."""
+"""What a mask's name may have in addition to its photograph's."""
 DRIVE = re.compile(r"^[a-zA-Z]:")
 ZEROS = re.compile(r"(?<![0-9])0+(?=[0-9])")
 NUMBERS = re.compile(r"(\D*)(\d*)", re.ASCII)
@@ -61,7 +61,7 @@ class Rule(NamedTuple):
 
     folder: Path
     dropped: int
-    """So many folders of the name are not there."""
+    """Number of leading folders of the name that do not exist."""
 
 
 def find_pictures(
@@ -72,22 +72,22 @@ def find_pictures(
     outside: bool = False,
     beside: Collection[Path] | None = None,
 ) -> dict[str, Path]:
-    """Return the file of each name; names that none fits are absent.
+    """Return the file of each name; names without a match are absent.
 
-    A name's own file in `folder` counts first. Else the pictures below `root` are searched, and the rule is taken that
-    finds most. Letters' case and endings may differ where one file alone then fits.
+    A name's own file in `folder` takes precedence. Otherwise the pictures below `root` are searched, and the rule that
+    finds most is used. Case and extension may differ if only one file then matches.
 
     Args:
         names: as the capture has them.
         folder: what they are relative to.
         root: the capture's folder.
-        source: the file that has the names, for messages.
-        outside: whether names may lead out of `root` and `folder`.
-        beside: the photographs, where what lies beside them is wanted: masks, which may be called with _mask, or depth
-            maps. None: photographs are wanted, and one that is found by another name is named.
+        source: the file that contains the names, for messages.
+        outside: whether names may point outside `root` and `folder`.
+        beside: the photographs, to find what belongs to them: masks, which may be called with _mask, or depth maps.
+            None: find photographs, and log any that is found by another name.
 
     Raises:
-        InputError: two folders fit alike, and neither is called as a folder of photographs is.
+        InputError: two folders match equally well, and neither has the name of a folder of photographs.
     """
     inside = [Path(os.path.abspath(each)) for each in (root, folder)]
     exact = {
@@ -101,7 +101,7 @@ def find_pictures(
     if not rules and beside is not None:
         rules = _rules(others, root, folder, beside, taken, by_number=True)
     if exact:
-        # Names are right as they are, and some files are missing; but their case or ending may differ, or the machine.
+        # The names are right, and some files are missing; but their case or extension may differ, or the machine.
         rules = {
             rule: found
             for rule, found in rules.items()
@@ -133,7 +133,7 @@ def find_pictures(
 
 
 def pictures_below(root: Path) -> list[Path]:
-    """Return the picture files in a folder and its subfolders, hidden ones apart, in order of their names.
+    """Return the picture files in a folder and its subfolders, except hidden ones, sorted by name.
 
     Links are followed.
     """
@@ -141,20 +141,20 @@ def pictures_below(root: Path) -> list[Path]:
     for base, folders, names in walk(root, through_links=True):
         folders[:] = [name for name in folders if not name.startswith(".")]
         pictures += [base / name for name in names if name.lower().endswith(ENDINGS) and not name.startswith(".")]
-    # A HEIC beside a JPEG of its name is the original of it.
+    # A HEIC next to a JPEG of the same name is its original.
     others = {path.with_suffix("") for path in pictures if path.suffix.lower() not in HEIC_ENDINGS}
     return sorted(p for p in pictures if p.suffix.lower() not in HEIC_ENDINGS or p.with_suffix("") not in others)
 
 
 def first_with_pictures(root: Path, folders: Sequence[str] = PICTURE_FOLDERS) -> Path | None:
-    """Return the first of some folders below `root` that has pictures."""
+    """Return the first of `folders` below `root` that contains pictures."""
     return next((root / name for name in folders if (root / name).is_dir() and pictures_below(root / name)), None)
 
 
 def pictures_by_stem(folder: Path) -> dict[str, Path]:
-    """Return the pictures of a folder by their names without ending, in order of these.
+    """Return the pictures of a folder by their names without extension, sorted by these.
 
-    Of several the one that lies highest counts, then the JPEG, which cameras write; others are named once.
+    Of several, the one at the highest level counts, then the JPEG, which cameras write; others are logged once.
     """
     found, twins = dict[str, Path](), list[str]()
     likeliest = sorted(pictures_below(folder), key=lambda path: (len(path.parts), path.suffix.lower() not in JPEG))
@@ -169,13 +169,13 @@ def pictures_by_stem(folder: Path) -> dict[str, Path]:
 def named_picture(
     folder: Path, name: str, inside: list[Path] | None = None, taken: Collection[Path] = ()
 ) -> Path | None:
-    """Return the file that a name is of as it stands, where it lies inside of one of some folders and is not taken.
+    """Return the file that a name denotes as written, if it is inside one of the folders and is not taken.
 
-    instant-ngp and Blender leave endings out.
+    instant-ngp and Blender omit extensions.
     """
     named = folder / name.replace("\\", "/")
     candidates = [named] if named.suffix.lower() in KNOWN_ENDINGS else []
-    if named.suffix.lower() in HEIC_ENDINGS and "HEIF" not in decoders():  # a phone's JPEG beside it is read
+    if named.suffix.lower() in HEIC_ENDINGS and "HEIF" not in decoders():  # a phone's JPEG next to it is read
         candidates = [*(named.with_suffix(ending) for ending in ENDINGS if ending not in HEIC_ENDINGS), *candidates]
     candidates += [named.with_name(named.name + ending) for ending in ENDINGS] if named.name else []
     allowed = (
@@ -187,7 +187,7 @@ def named_picture(
 
 
 def why_absent(name: str, folder: Path, root: Path) -> str:
-    """Return why no file is found by the name of a picture, and what to do.
+    """Return why no file is found for the name of a picture, and what to do.
 
     Args:
         name: as the capture has it.
@@ -217,7 +217,7 @@ def why_absent(name: str, folder: Path, root: Path) -> str:
 
 
 def is_absolute(name: str) -> bool:
-    r"""Return whether a name begins at a root, of Windows too.
+    r"""Return whether a name begins at a root, including those of Windows.
 
     >>> is_absolute("/home/a.jpg"), is_absolute(r"C:\a.jpg"), is_absolute("images/a.jpg")
     (True, True, False)
@@ -231,9 +231,9 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _plain(parts: tuple[str, ...], by_number: bool = False) -> tuple[str, ...]:
-    """Return parts of a path as they are compared: without ending and case, %20 or a space, and one form of letters.
+    """Return parts of a path normalized for comparison: without extension and case, %20 as a space, one Unicode form.
 
-    `by_number` compares numbers, too, whatever zeros they begin with.
+    `by_number` compares numbers, too, regardless of leading zeros.
     """
     *folders, last = (unicodedata.normalize("NFC", unquote(part)).casefold() for part in parts)
     while (stem := Path(last)).suffix in KNOWN_ENDINGS and stem.stem:  # masks are called 0001.jpg.png
@@ -249,7 +249,7 @@ def _rules(
     taken: Collection[Path],
     by_number: bool = False,
 ) -> dict[Rule, dict[str, Path]]:
-    """Return the files that each rule finds, where it finds another for every name, and none that is taken."""
+    """Return the files that each rule finds, if it finds a different one for every name, and none that is taken."""
     below = _by_plain_name(dict.fromkeys((root, folder)), beside is not None, taken, by_number)
     fits: dict[Rule, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     for name in names:
@@ -271,7 +271,7 @@ def _rules(
 def _by_plain_name(
     places: Iterable[Path], masks: bool, taken: Collection[Path], by_number: bool
 ) -> dict[str, list[tuple[Path, tuple[str, ...], set[str]]]]:
-    """Return the pictures below some folders, with their path as it is compared and the folders that they are in."""
+    """Return the pictures below some folders, with their normalized path and the folders that they are in."""
     below = defaultdict(list)
     for place in places:
         for path in pictures_below(place):
@@ -288,14 +288,14 @@ def _by_plain_name(
 
 
 def _of_one_kind(wanted: set[str], folders: set[str]) -> bool:
-    """Return whether a file in these folders can be what a name with those means, and not of another split or kind."""
+    """Return whether a file in `folders` can match a name with folders `wanted`, being of the same split and kind."""
     beside = {folder for folder in folders - wanted if BESIDE_PHOTOGRAPHS.fullmatch(folder)}
     splits = wanted & set(SPLIT_FOLDERS)
     return not beside and not (splits and folders & set(SPLIT_FOLDERS) - splits)
 
 
 def numeric_order(names: Sequence[str]) -> list[str]:
-    """Return names in order of the numbers in them.
+    """Return names sorted by the numbers in them.
 
     >>> numeric_order(["picture_10", "picture_2"])
     ['picture_2', 'picture_10']
@@ -304,7 +304,7 @@ def numeric_order(names: Sequence[str]) -> list[str]:
 
 
 def _one_each(found: dict[str, list[Path]]) -> dict[str, Path]:
-    """Return the one file that fits each name: of several the one whose ending does, too."""
+    """Return the one file that matches each name: of several, the one whose extension matches, too."""
     chosen = {}
     for name, paths in found.items():
         alike = [path for path in paths if path.suffix.lower() == Path(name).suffix.lower()]
@@ -324,7 +324,7 @@ def _common_end(a: tuple[str, ...], b: tuple[str, ...]) -> int:
 
 
 def _rank(rule: Rule, folder: Path, root: Path) -> tuple[int, bool, int]:
-    """Return what makes one rule likelier than another that finds as many: the less is dropped the better."""
+    """Return the sort key of rules that find equally many: the less is dropped the better."""
     below = rule.folder.relative_to(root).as_posix() if rule.folder.is_relative_to(root) else "."
     name = "" if below == "." else below.lower()
     place = PICTURE_FOLDERS.index(name) if name in PICTURE_FOLDERS else len(PICTURE_FOLDERS)

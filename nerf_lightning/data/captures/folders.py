@@ -1,4 +1,4 @@
-"""Which folder a capture lies in: the one that the user named, one below it, or the one that it is a part of."""
+"""Locate a capture's folder: the one that the user named, one below it, or the one that contains it."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -11,15 +11,15 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "train")
-"""Folders within a capture, whose parent is meant where one of them is given."""
+"""Folders within a capture; if one of them is given, its parent is meant."""
 DEEPEST, MOST_FOLDERS = 3, 1000
-"""How far below a folder, and in how many folders of a level, captures are looked for."""
+"""How deep below a folder, and in how many folders of a level, captures are searched for."""
 
 Found = TypeVar("Found")
 
 
 def named_folder(root: str) -> Path:
-    """Return the folder that the user named, or the one of the file; `InputError` says that there is none."""
+    """Return the folder that the user named, or that of the named file; raise `InputError` if there is none."""
     try:
         folder = Path(root).expanduser()
     except RuntimeError as error:
@@ -37,17 +37,17 @@ def named_folder(root: str) -> Path:
 
 
 def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:
-    """Return what a folder holds, as a list of one; or the capture that it is a part of, or those that lie below it.
+    """Return a folder's own capture, as a list of one; or the capture that contains it, or those below it.
 
     Args:
-        folder: as the user named it.
-        capture_in: returns what a folder itself holds, None where it holds no capture.
+        folder: as named by the user.
+        capture_in: returns what a folder itself contains; None if it contains no capture.
     """
 
     def near(path: Path) -> Found | None:
         try:
             return capture_in(path)
-        except (OSError, InputError):  # it is not the user's
+        except (OSError, InputError):  # not a folder that the user named
             return None
 
     known, part = capture_in(folder), folder.resolve()
@@ -65,7 +65,7 @@ def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Fo
 
 
 def require_one(folders: Sequence[Path], root: str) -> None:
-    """Refuse a folder `root` that holds several captures."""
+    """Refuse a folder `root` that contains several captures."""
     if len(folders) > 1:
         choice = listed((f"scene.root={path}" for path in folders), 4)
         raise InputError(f"{root} holds {len(folders)} captures. Choose one of them: {choice}.")
@@ -74,5 +74,5 @@ def require_one(folders: Sequence[Path], root: str) -> None:
 def _folders_in(folder: Path) -> list[Path]:
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_dir())
-    except OSError:  # may not be listed
+    except OSError:  # not listable
         return []

@@ -25,7 +25,7 @@ SOURCE = "scene_from_cameras"
 
 
 class InMemoryReader(Reader):
-    """Stand in the config of a run whose scene was given from Python.
+    """Placeholder in the config of a run whose scene was given from Python.
 
     Args:
         name: of the scene.
@@ -35,7 +35,7 @@ class InMemoryReader(Reader):
         self.name = name
 
     def read(self) -> Scene:
-        """Refuse: the images are in no file.
+        """Refuse: the images are not in a file.
 
         Raises:
             InputError: always.

@@ -1,4 +1,4 @@
-"""Cameras at the size of the pixels that are read, and which photographs fit theirs."""
+"""Scale cameras to the pixels that are read, and check that photographs fit their cameras."""
 
 import logging
 from dataclasses import replace
@@ -13,15 +13,15 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 
 LARGEST_STRETCH = 0.01
-"""Of width and height: how far a picture's scale may differ from one axis to the other."""
+"""How much a picture's scale may differ between width and height."""
 
 log = logging.getLogger(__name__)
 
 
 def as_calibrated(capture: Capture) -> Capture:
-    """Return the capture with photographs turned where their EXIF tag says so and the camera's size fits that alone.
+    """Return the capture with photographs rotated if their EXIF tag says so and only that fits the camera's size.
 
-    Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which. Those whose
+    Programs that find cameras read the pixels as stored, or rotated upright; the sizes tell which. Views whose
     photograph is unreadable, or fits its camera in neither way, are left out.
     """
     views, kept, turned = list(capture.views), [], []
@@ -47,12 +47,12 @@ def as_calibrated(capture: Capture) -> Capture:
 
 
 def _fits(view: View, width: int, height: int) -> bool:
-    # A shrunk picture's size is rounded: allow a pixel on either side.
+    # A shrunk picture's size is rounded: allow a pixel either way.
     return abs(width / view.size[0] * view.size[1] / height - 1.0) <= LARGEST_STRETCH + 1.0 / min(width, height)
 
 
 def require_fit(view: View, width: int, height: int) -> None:
-    """Refuse a picture that is no shrunk copy of what its camera describes."""
+    """Refuse a picture that is not a shrunk copy of what its camera describes."""
     if not _fits(view, width, height):
         raise InputError(
             f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for {view.size[0]:g} "
@@ -65,11 +65,11 @@ def require_fit(view: View, width: int, height: int) -> None:
 def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
     """Return the cameras at the size of the pixels that were read.
 
-    The intrinsics hold for the sizes that the format names, `files` are (width, height) of each picture file, and what
-    `downscale` leaves over was cropped at the right and the bottom.
+    The intrinsics are valid for the sizes in the format, `files` are (width, height) of each picture file, and the
+    remainder of `downscale` was cropped at the right and the bottom.
 
     Raises:
-        InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are another capture's.
+        InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are of another capture.
     """
     sizes = [downscaled_size(width, height, downscale) for width, height in files]
     if sizes != list(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)):

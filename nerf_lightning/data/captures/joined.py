@@ -1,4 +1,4 @@
-"""One of several captures that were joined into a scene, as a scene again."""
+"""Extract one of several captures that were joined into a scene."""
 
 import logging
 from dataclasses import replace
@@ -14,10 +14,10 @@ log = logging.getLogger(__name__)
 
 
 def shown_capture(scene: Record) -> Record:
-    """Return what is shown of a scene where one capture is: of several the first that is never trained on, if any is.
+    """Return the one capture to show: of several, the first that is never trained on, if any.
 
     Args:
-        scene: one capture, or several that were joined; or the record of one.
+        scene: of one capture, or of several joined ones; or its record.
     """
     if scene.capture_of is None:
         return scene
@@ -28,11 +28,11 @@ def shown_capture(scene: Record) -> Record:
 
 
 def one_capture(scene: Record, number: int) -> Record:
-    """Return one of the captures that were joined, as a scene, or a record, of its own.
+    """Return one of the joined captures as a scene, or a record, of its own.
 
     Args:
-        scene: one whose views are of several captures (`capture_of`), or its record.
-        number: of the capture.
+        scene: a scene whose views are of several captures (`capture_of`), or its record.
+        number: index of the capture.
     """
     assert scene.capture_of is not None
     views = [view for view, capture in enumerate(scene.capture_of) if capture == number]

@@ -1,4 +1,4 @@
-"""Pixels whose distance is known: where structure from motion saw its sparse points, or a depth sensor measured."""
+"""Pixels of known distance, from the sparse points of structure from motion or from a depth sensor."""
 
 import logging
 import math
@@ -21,24 +21,24 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.nerf.types.tensor_struct import concatenate
 
 CERTAIN = 0.03
-"""Relative error of a distance at which it counts half."""
+"""Relative error at which a distance counts half."""
 LEAST_ERROR, UNKNOWN_ERROR = 0.3, 1.0
-"""Pixels: no feature is found more exactly; what is assumed where nobody says."""
+"""Reprojection error in pixels: the minimum, and the default if none is given."""
 LEAST_CERTAINTY = 0.05
 OF_A_SENSOR = 0.9
 """Certainty of a measured distance: sensors err by a hundredth."""
 MOST_OF_A_MAP = 4096
-"""Pixels of a depth map that are taken, evenly spread."""
+"""Maximum number of pixels used of a depth map, evenly spread."""
 LEVELS = 1000
-"""Of a sensor's levels, which are millimeters, in a unit of the capture."""
+"""Number of a sensor's levels, which are millimeters, in a unit of the capture."""
 STRETCH = 0.02
-"""Of a depth map's sides, against the photograph's: of another shape it is another picture's."""
+"""Tolerance of a depth map's aspect ratio against the photograph's: beyond, it belongs to another picture."""
 
 log = logging.getLogger(__name__)
 
 
 def known_depths(capture: Capture, cameras: Cameras) -> KnownDepths | None:
-    """Return all distances that a capture knows, in its own units; None where there is none.
+    """Return all known distances of a capture, in its own units; None if there are none.
 
     Args:
         capture: with tracks, or depth maps, or neither.
@@ -55,11 +55,11 @@ def known_depths(capture: Capture, cameras: Cameras) -> KnownDepths | None:
 
 
 def depths_of_maps(maps: Sequence[tuple[Path | None, float | None]], level: float, cameras: Cameras) -> KnownDepths:
-    """Return distances that depth sensors measured; maps that cannot be used are left out and named.
+    """Return distances measured by depth sensors; unusable maps are left out and logged.
 
     Args:
-        maps: one per view, of any size of the photograph's shape (None: there is none), and its unit's length in the
-            units of the cameras; None: `level`, or 1000 of them where it holds lengths.
+        maps: one per view, of any size with the photograph's aspect ratio (None: no map), and its unit's length in the
+            units of the cameras; None: `level`, or 1000 of them if it contains lengths.
         level: the length of a sensor's level, in the units of the cameras.
         cameras: at the size of the pixels.
     """
@@ -101,13 +101,13 @@ def depths_of_points(
 ) -> KnownDepths:
     """Return the distances of sparse points from the cameras that saw them, in the units of the cameras.
 
-    A distance is as uncertain as the point's reprojection error makes it: relative to the distance, the error's angle
-    over that between the rays that meet in the point. What is too uncertain is left out, as is what lies behind a
-    camera or outside of its picture.
+    A distance's uncertainty follows from the point's reprojection error: relative to the distance, it is the error's
+    angle over that between the rays that meet in the point. Distances that are too uncertain are left out, as are
+    points behind a camera or outside its picture.
 
     Args:
         points: in the cameras' frame.
-        errors: mean distance in pixels between where a point was seen and where it projects to.
+        errors: mean reprojection error of each point in pixels.
         tracks: which point was seen in which view.
         cameras: at the size of the pixels.
     """
@@ -131,7 +131,7 @@ def depths_of_points(
 
 
 def spread(directions: Float[Tensor, "seen 3"], point: Int[Tensor, "seen"], num_points: int) -> Float[Tensor, "points"]:
-    """Return about the largest angle between any two directions of each point: twice that from their mean, radians."""
+    """Return about the largest angle (radians) between any two directions of each point: twice that from their mean."""
     mean = torch.zeros(num_points, 3, dtype=directions.dtype).index_add_(0, point, directions)
     mean = functional.normalize(mean, dim=-1)
     angle = 2.0 * ((directions - mean[point]).norm(dim=-1) / 2.0).clamp(max=1.0).asin()

@@ -1,4 +1,4 @@
-"""What a capture has and cannot be used: it is left out and named once. Only too few views that remain are refused."""
+"""Unusable parts of a capture: they are left out and logged once. Only too few remaining views are refused."""
 
 import logging
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 FEWEST_VIEWS = 3
-"""That must remain once a view is left out."""
+"""Minimum number that must remain once a view is left out."""
 SHOWN = 3
 ALL_CAMERAS = "To use them, let their cameras be found: scene=photos scene.root=FOLDER, their folder."
 """The advice where more photographs lack a pose than have one."""
@@ -28,22 +28,22 @@ class LeftOut:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return all that is left out."""
+        """Return the names of all that is left out."""
         return tuple(dict.fromkeys((*self.without_pose, *self.faults)))
 
     @contextmanager
     def unless_usable(self, name: str) -> Iterator[None]:
-        """Leave the view `name` out where what is done with it is refused."""
+        """Leave the view `name` out if the block raises `InputError`."""
         try:
             yield
         except InputError as error:
             self.faults[name] = str(error)
 
     def require_enough(self, remaining: int) -> None:
-        """Refuse a capture of which too few views remain.
+        """Refuse a capture if too few views remain.
 
         Raises:
-            InputError: fewer than three, with what is wrong with the first that is left out.
+            InputError: fewer than three remain; the message says what is wrong with the first one left out.
         """
         if not self.faults or remaining >= FEWEST_VIEWS:
             return
@@ -56,7 +56,7 @@ class LeftOut:
         )
 
     def say(self, remaining: int) -> None:
-        """Say once what is left out, and why the first view is."""
+        """Log once what is left out, and why the first view is."""
         if self.faults:
             log.warning(
                 "%s: %d of %d views are left out: %s. The first: %s",

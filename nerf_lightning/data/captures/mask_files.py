@@ -1,4 +1,4 @@
-"""Which photograph has which mask: as the capture's files say, as scene.masks says, or by a folder called masks."""
+"""Match masks to photographs: by the capture's files, by scene.masks, or by a folder called masks."""
 
 import logging
 from collections.abc import Sequence
@@ -17,25 +17,25 @@ from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 
 FOLDERS = ("masks", "mask")
 MOST_READ = 4
-"""Masks of a folder that nothing names, which are read to see whether they are masks."""
+"""Number of masks that are read from an unnamed folder to check that they are masks."""
 NO_MASKS = "none"
 
 log = logging.getLogger(__name__)
 
 
 def with_masks(capture: Capture, masks: str | None, named: Path | None, folders: Sequence[Path], keeps: str) -> Capture:
-    """Return the views with their masks; photographs without one are kept whole.
+    """Return the views with their masks; photographs without a mask are kept whole.
 
     Args:
-        capture: its views may have masks already, which its files name.
-        masks: the setting: a folder, none, or None for what the files name, or else for a folder in one of `folders`
-            that has one mask for each photograph.
-        named: the folder that the setting names, if it does.
-        folders: where a folder that nothing names may lie, the likeliest first.
-        keeps: the color of what is kept, for messages.
+        capture: its views may already have masks, which its files name.
+        masks: the setting: a folder, none, or None for those that the files name, or else for a folder in one of
+            `folders` that has one mask per photograph.
+        named: the folder that the setting names, if any.
+        folders: where an unnamed folder may be, the likeliest first.
+        keeps: the color of kept pixels, for messages.
 
     Raises:
-        InputError: the folder that was named has none, or there are none whose color could matter.
+        InputError: the named folder has no masks, or there are none to which the color could apply.
     """
     found = {view.name: view.photograph.mask for view in capture.views if view.photograph.mask is not None}
     if masks == NO_MASKS:
@@ -67,7 +67,7 @@ def with_masks(capture: Capture, masks: str | None, named: Path | None, folders:
 
 
 def _masks_beside(folders: Sequence[Path], capture: Capture) -> dict[str, Path]:
-    """Return the masks of a folder that nothing names, where it has one for each photograph; say what is done."""
+    """Return the masks of an unnamed folder if it has one for each photograph; log what is done."""
     for folder in dict.fromkeys(each / name for each in folders for name in FOLDERS):
         if not folder.is_dir() or not pictures_below(folder):
             continue
@@ -87,7 +87,7 @@ def _masks_beside(folders: Sequence[Path], capture: Capture) -> dict[str, Path]:
 
 
 def _suitable(folder: Path, capture: Capture) -> tuple[dict[str, Path], str | None]:
-    """Return the masks that a folder has, and why they do not suit all photographs, if they do not.
+    """Return the masks in a folder, and why they do not suit all photographs, if they do not.
 
     All sizes are compared, and a few masks are read.
     """

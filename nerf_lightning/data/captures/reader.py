@@ -1,4 +1,4 @@
-"""What all captures share: from a format's views to a scene in a working frame."""
+"""The base of all capture readers: turn a format's views into a scene in a working frame."""
 
 import logging
 import os
@@ -33,7 +33,7 @@ from nerf_lightning.nerf.geometry.poses import flip_yz
 from nerf_lightning.nerf.types.scene import Background, PixelStore, Scene
 
 OF_PANORAMAS = 3.2
-"""How many times as long as photographs panoramas may be, whose pixels cover all directions."""
+"""Factor by which panoramas may be longer than photographs, as their pixels cover all directions."""
 
 Axes = Literal["opengl", "opencv"]
 Poses = Literal["c2w", "w2c"]
@@ -43,26 +43,26 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class CaptureReader(Reader):
-    """Read photographs with poses; a subclass says what its format holds.
+    """Read photographs with poses; a subclass defines its format.
 
     Args:
         root: the capture's folder.
-        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that they
-            are at most `longest`.
+        downscale: integer factor by which photographs are shrunk; focal lengths are scaled, too. auto: such that
+            photographs are at most `longest`.
         longest: pixels of the longer side for downscale=auto. 640 are enough for a few minutes on a CPU; nerf train
             takes 1600 on a GPU.
         hold_every: the first and every k-th view after it are held out for evaluation, if the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
         masks: a folder below root with masks, named like their photographs (or with .png added, or instead of the
             extension); photographs without a mask are used whole. null: those that the format names, or else a folder
-            masks that has one for each photograph. none: no masks.
+            masks with one per photograph. none: no masks.
         masks_keep: the color of masks that is kept, white or black; the other is ignored.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         axes: opengl, or opencv where the cameras in the files have axes right, down, forward although the format's are
             others; the doctor recognizes it.
         poses: c2w (camera to world), or w2c (world to camera) where the files have the inverse of the format's poses.
-        coordinates: fitted (upright, centered, of a handy size), or given: poses, near, far and the box are kept as
-            files or settings give them.
+        coordinates: fitted (upright, centered, of a convenient size), or given: poses, near, far and the box are kept
+            as in files or settings.
         near: distance at which content begins, in the capture's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
         aabb_half: half the side of the box around the origin that holds the content, with coordinates=given; null: the
@@ -81,7 +81,7 @@ class CaptureReader(Reader):
     """
 
     behind: ClassVar[Background] = "black"
-    """The background of a format where nobody says another."""
+    """The format's default background."""
 
     root: str
     downscale: int | Literal["auto"] = 1
@@ -107,7 +107,7 @@ class CaptureReader(Reader):
 
     @abstractmethod
     def capture(self) -> Capture:
-        """Return what the format says, before any pixel is read.
+        """Return the content of the files, before any pixel is read.
 
         Raises:
             InputError: anything wrong with the files.
@@ -117,7 +117,7 @@ class CaptureReader(Reader):
         """Return the capture as a scene, in a working frame or its own.
 
         Raises:
-            InputError: a setting that makes no sense, or anything wrong with the files.
+            InputError: a setting makes no sense, or anything is wrong with the files.
         """
         self.check_settings()
         with reading(self.root):
@@ -161,7 +161,7 @@ class CaptureReader(Reader):
         )
 
     def hold_out(self, views: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the views to learn from, and those to judge by, where the format names no splits.
+        """Return the training views and the held-out views, if the format names no splits.
 
         Raises:
             InputError: one of the two would be empty.
@@ -171,7 +171,7 @@ class CaptureReader(Reader):
         return every_kth(views, self.hold_every)
 
     def protocol(self, judged_by: str) -> dict[str, str]:
-        """Return what measured numbers depend on, besides how the pixels were made.
+        """Return what measured numbers depend on, besides how the pixels were prepared.
 
         Args:
             judged_by: the split whose views are the test views, or how they were held out.
@@ -181,16 +181,16 @@ class CaptureReader(Reader):
         return {"hold_every": str(self.hold_every), "frames": self.frames or "all"} | said
 
     def folder(self) -> Path:
-        """Return the capture's folder: `root`, the one folder just below it that is one, or the one above it.
+        """Return the capture's folder: `root`, the only one just below it, or the one above it.
 
         Raises:
-            InputError: there is no such folder, or several are such captures.
+            InputError: there is no such folder, or there are several.
         """
         return self.found_folder
 
     @cached_property
     def found_folder(self) -> Path:
-        """What `folder` returns, searched for once; who has searched already sets it."""
+        """The result of `folder`, cached; callers that have already searched set it."""
         folder = named_folder(self.root)
         found = located(folder, lambda path: path if self.found_in(path) else None)
         require_one(found, self.root)
@@ -199,12 +199,12 @@ class CaptureReader(Reader):
         return found[0] if found else folder
 
     def top(self) -> Path:
-        """Return the folder that may hold pictures: the capture's, or the one above it that the user named."""
+        """Return the folder that may contain pictures: the capture's, or the one above it that the user named."""
         named, folder = named_folder(self.root), self.folder()
         return named if folder.is_relative_to(named) else folder
 
     def below(self, name: str) -> Path:
-        """Return what a setting names: below the folder that the user named, or below the capture's."""
+        """Return the path that a setting names: below the folder that the user named, or below the capture's."""
         paths = [self.top() / name, self.folder() / name]
         return next(filter(os.path.lexists, paths), paths[-1])
 
@@ -226,7 +226,7 @@ class CaptureReader(Reader):
                 capture = capture.some(kept)
 
     def _factor(self, capture: Capture) -> int:
-        """Return by what the photographs shrink."""
+        """Return the factor by which photographs shrink."""
         if self.downscale != "auto":
             return self.downscale
         longest = max(max(upright_size(view.photograph)) for view in capture.views)
@@ -249,7 +249,7 @@ class CaptureReader(Reader):
         check_extent(self.space, self.near, self.far, self.coordinates, self.aabb_half)
 
     def _wanted(self, capture: Capture) -> Capture:
-        """Return the views whose names fit the pattern `frames`."""
+        """Return the views whose names match the pattern `frames`."""
         if self.frames is None:
             return capture
         faults = capture.left_out.faults
@@ -288,7 +288,7 @@ class CaptureReader(Reader):
 
 
 def as_meant(capture: Capture, axes: Axes, poses: Poses) -> Capture:
-    """Return a capture whose poses are camera to world with axes right, up, back, from what its files have instead."""
+    """Return a capture whose poses are converted to camera to world with axes right, up, back."""
 
     def turned(c2w: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
         if poses == "w2c":

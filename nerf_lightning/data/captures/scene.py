@@ -1,4 +1,4 @@
-"""From views with cameras and pixels, in the user's frame, to a scene in a working frame."""
+"""Turn views with cameras and pixels, in the user's frame, into a scene in a working frame."""
 
 import logging
 from dataclasses import replace
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 def check_extent(
     space: str, near: float | None, far: float | None, coordinates: str = "fitted", aabb_half: float | None = None
 ) -> None:
-    """Refuse a space or coordinates that do not exist, distances between which nothing lies, and a box of no size."""
+    """Refuse unknown spaces or coordinates, an empty range of distances, and a box without size."""
     require_one_of(get_args(Coordinates), **{"scene.coordinates": coordinates})
     if space not in get_args(Spaces):
         raise InputError(f"scene.space={space!r}: choose one of {', '.join(get_args(Spaces))}.")
@@ -53,25 +53,25 @@ def scene_of(
     coordinates: Coordinates = "fitted",
     aabb_half: float | None = None,
 ) -> Scene:
-    """Return a capture as a scene, in its own frame or in a working frame: upright, centered, of a handy size.
+    """Return a capture as a scene, in its own frame or in a working frame: upright, centered, of a convenient size.
 
     Args:
         capture: names, sparse points and bounds, in the user's frame.
         cameras: of its views, in the user's frame (float64), at the size of the pixels.
         pixels: of its views.
-        splits: numbers of its views.
+        splits: indices of its views.
         name: of the scene.
-        space: how much of the world is modeled; auto: what suits cameras and points.
+        space: how much of the world is modeled; auto: suited to cameras and points.
         near: distance at which content may begin, in the user's units; None: from the capture.
         far: distance at which content ends; None: from the capture.
-        background: what lies behind the scene.
-        protocol: how the pixels were made.
-        metres_per_unit: how many meters a unit of the user's frame is long; None: unknown.
-        coordinates: given: the capture's own frame is kept, with near, far and the box that are given.
-        aabb_half: half the side of the box around the origin, for coordinates that are given; None: the capture's box.
+        background: the color behind the scene.
+        protocol: how the pixels were prepared.
+        metres_per_unit: length of a unit of the user's frame in meters; None: unknown.
+        coordinates: given: keep the capture's own frame, with the given near, far and box.
+        aabb_half: half the side of the box around the origin, for given coordinates; None: the capture's box.
 
     Raises:
-        InputError: cameras and content that leave no room for a scene.
+        InputError: cameras and content leave no room for a scene.
     """
     names = tuple(view.name for view in capture.views)
     chosen: Space

@@ -1,4 +1,4 @@
-"""Which views are learned from and which are held out."""
+"""Split views into training views and held-out views."""
 
 import logging
 from collections.abc import Callable, Hashable, Sequence
@@ -8,7 +8,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 MEMORISED = {"test_views": "learned from"}
-"""Stands in the protocol of numbers that say how well photographs are remembered, and nothing of new views."""
+"""The protocol of numbers that measure how well photographs are memorized, not new views."""
 
 View = TypeVar("View", bound=Hashable)
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def in_order(views: Sequence[int], train_fraction: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the first views, the share `train_fraction` of them rounded down, and the rest.
+    """Return the first views (the share `train_fraction`, rounded down) and the rest.
 
     >>> in_order(range(5), 0.8)
     ((0, 1, 2, 3), (4,))
@@ -29,7 +29,7 @@ def in_order(views: Sequence[int], train_fraction: float) -> tuple[tuple[int, ..
 
 
 def every_kth(views: Sequence[int], k: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the views that stay and those that are held out: the first and every `k`-th after it.
+    """Return the training views and the held-out ones: the first and every `k`-th after it.
 
     >>> every_kth(range(5), 2)
     ((1, 3), (0, 2, 4))
@@ -45,13 +45,13 @@ def every_kth(views: Sequence[int], k: int) -> tuple[tuple[int, ...], tuple[int,
 def apart(
     train: Sequence[View], val: Sequence[View], test: Sequence[View], named: Callable[[View], str], source: str
 ) -> tuple[View, ...]:
-    """Return the views to learn from without those to judge by, and say which are left out.
+    """Return the training views without the held-out ones, and log which are left out.
 
-    Where a capture lists the very same views for training and test, that is meant; `checks.check_scene` warns of it.
-    `named` returns a view's name, and `source` lists them.
+    If a capture lists exactly the same views for training and test, that is intended; `checks.check_scene` warns about
+    it. `named` returns a view's name, and `source` is the file that lists them.
 
     Raises:
-        InputError: less than half of the views to learn from would be left, so that either list may be the mistake.
+        InputError: fewer than half of the training views would be left, so either list may be wrong.
     """
     held = {*val, *test}
     both = [view for view in train if view in held]

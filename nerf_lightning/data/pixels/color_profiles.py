@@ -1,4 +1,4 @@
-"""Color profiles (ICC): what phones and cameras save in other colors becomes sRGB, which everything here expects."""
+"""Color profiles (ICC): convert pictures that phones and cameras save in other color spaces to sRGB."""
 
 import io
 import logging
@@ -13,25 +13,25 @@ from PIL import Image, ImageCms
 from nerf_lightning.messages.escaping import for_terminal
 
 ROUNDING = 2
-"""Levels of 255 by which a profile may differ from sRGB and count as sRGB."""
+"""Levels of 255 by which a profile may differ from sRGB and still count as sRGB."""
 MOST_BYTES = 1 << 22
-"""Of a profile; those of screens and cameras have some kilobytes, and of printers a megabyte."""
+"""Maximum size of a profile; those of screens and cameras have some kilobytes, and of printers a megabyte."""
 LEVELS = np.linspace(0, 255, 9).round().astype(np.uint8)
 MODES = {"1": "L", "L": "L", "LA": "L", "P": "RGB", "PA": "RGB", "RGB": "RGB", "RGBA": "RGB", "CMYK": "CMYK"}
-"""The mode that profiles are about, by that of the picture."""
+"""The mode that profiles apply to, by the picture's mode."""
 
 log = logging.getLogger(__name__)
 _saying = threading.Lock()
 
 
 def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.Image]:
-    """Return what makes parts of a picture RGBA in sRGB; alpha is kept.
+    """Return a function that converts parts of a picture to RGBA in sRGB; alpha is kept.
 
-    What is converted is said once for each folder. A profile that cannot be used is ignored.
+    Conversions are logged once per folder. Unusable profiles are ignored.
 
     Args:
         image: the picture, decoded.
-        folder: where it lies, for the message.
+        folder: that of the picture, for the message.
     """
     profile, mode = image.info.get("icc_profile"), MODES.get(image.mode)
     is_known = mode is not None and isinstance(profile, bytes) and 0 < len(profile) <= MOST_BYTES
@@ -54,7 +54,7 @@ def to_srgb(image: Image.Image, folder: Path) -> Callable[[Image.Image], Image.I
 
 @lru_cache(maxsize=8)
 def _transform(profile: bytes, mode: str) -> tuple[str, ImageCms.ImageCmsTransform | None]:
-    """Return a profile's name, and what takes its colors to sRGB; None where it is sRGB, damaged, or of other modes."""
+    """Return a profile's name and its transform to sRGB; None if it is sRGB, damaged, or for other modes."""
     try:
         known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         transform = ImageCms.buildTransform(known, ImageCms.createProfile("sRGB"), mode, "RGB")

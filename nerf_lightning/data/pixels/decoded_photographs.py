@@ -1,4 +1,4 @@
-"""Photographs, with masks, to a pixel store that is decoded once and mapped from then on; and hashes of them."""
+"""Decode photographs and masks into a pixel store once and map it from then on; hash photographs."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
 
-# Megapixels that take a few seconds: from here on there is a progress bar.
+# Megapixels that take a few seconds: beyond, show a progress bar.
 NOTICEABLE_PIXELS = 50_000_000
 NOTICEABLE_FILES = 1000
 TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
@@ -32,33 +32,33 @@ TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda stored: np.rot90(stored, 2).T,
     8: np.rot90,
 }
-"""What shows pixels by their EXIF orientation, of those that swap width and height."""
+"""Rotations of pixels by their EXIF orientation, for those that swap width and height."""
 THINNED = 1 << 28
-"""Bytes that are hashed of pixels that are more than memory may hold (`CHECKED_WHOLE`): they come from the disk."""
+"""Bytes that are hashed of pixels that may exceed memory (`CHECKED_WHOLE`) and come from the disk."""
 LEAST_RESIZED = 0.8
-"""What a resized picture's sides are at most, of the larger ones."""
+"""Sides of a resized picture are at most this share of the larger ones."""
 NOTICEABLE_BYTES = 1 << 31
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture file, and perhaps one that says which of its pixels count."""
+    """A picture file, and optionally a mask of the pixels that count."""
 
     path: Path
     mask: Path | None = None
     """A gray picture of the same shape, white and black (`masks.read_mask`)."""
     mask_keeps: MaskColor | None = None
-    """None: what the user says, else white."""
+    """None: as the user says, else white."""
     radius: float | None = None
-    """Of the circle around the picture's middle that counts, in pixels as they are stored; None: all do."""
+    """Radius of the circle around the picture's center that counts, in pixels as stored; None: all pixels count."""
     transparent: int | None = None
-    """The level of red, green and blue that means transparent, where the capture says so: 255 (white) or 0."""
+    """The level of red, green and blue that means transparent, if the capture says so: 255 (white) or 0."""
     upright: bool = False
-    """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
+    """Whether the pixels are rotated according to an EXIF tag; else they are read as stored."""
     header: PictureHeader | None = None
-    """Of the picture, where it was read already."""
+    """Of the picture, if already read."""
     number: int | None = None
-    """Of the picture, in a file of several."""
+    """Index of the picture in a file with several."""
 
     def rgba(self) -> UInt8[np.ndarray, "height width 4"]:
         """Return the pixels, with straight alpha."""
@@ -66,7 +66,7 @@ class Photograph:
 
 
 def upright_size(photograph: Photograph) -> tuple[int, int]:
-    """Return (width, height) in pixels as the photograph is read."""
+    """Return (width, height) in pixels of the photograph as it is read."""
     width, height = (photograph.header or read_header(photograph.path)).size
     return (height, width) if photograph.upright else (width, height)
 
@@ -76,22 +76,21 @@ def read_photographs(
 ) -> PixelStore:
     """Return the photographs, in order; they may differ in size.
 
-    Decoded pixels are kept in the cache folder as one file, which every later call maps into memory at once. It
-    belongs to the files' names, sizes and times of change, and to `downscale`; where one of them changes, another is
-    made. Shrunk photographs lose what `downscale` leaves over at the right and the bottom; a shrunk pixel is kept if
-    its mask keeps its whole block.
+    Decoded pixels are cached as one file, which later calls map into memory at once. It is keyed by the files' names,
+    sizes and modification times, and by `downscale`; if one of them changes, another is made. Shrunk photographs lose
+    the remainder of `downscale` at the right and the bottom; a shrunk pixel is kept if its mask keeps its whole block.
 
     Args:
         photographs: the files, at least one.
-        downscale: whole factor of the area filter; 1 keeps the pixels as they are.
+        downscale: whole factor of the area filter; 1 keeps the pixels unchanged.
         cache_dir: where the decoded pixels are kept; None: in the user's cache folder
             (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
-        verify: read all files to see whether their contents are still those that were decoded.
-        label: what is read, for the progress bar.
+        verify: read all files to check that their contents have not changed since they were decoded.
+        label: for the progress bar.
 
     Raises:
-        InputError: a file is absent, cannot be decoded or is refused by `images.read_rgba`; a mask is of another
-            size or keeps nothing; or the cache folder has no room.
+        InputError: a file is missing, cannot be decoded or is refused by `images.read_rgba`; a mask has another size or
+            keeps nothing; or the cache folder is full.
     """
     if not photographs:
         raise InputError(f"{label}: there is no photograph to read. Check the capture's folder.")
@@ -108,7 +107,7 @@ def read_photographs(
 
 
 def _key(photographs: Sequence[Photograph], downscale: int) -> str:
-    """Return what the kept pixels are found by."""
+    """Return the cache key of the pixels."""
     files = [
         [None if path is None else identity_of(path) for path in (photograph.path, photograph.mask)]
         for photograph in photographs
@@ -123,7 +122,7 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
 
 
 def identity_of(path: Path) -> tuple[str, int, int]:
-    """Return name, size and time of change, by which a file is taken for the one that it was."""
+    """Return name, size and modification time, by which a file counts as unchanged."""
     try:
         state = path.stat()
     except OSError as error:
@@ -137,7 +136,7 @@ def _hash_of_contents(photographs: Sequence[Photograph], label: str) -> str:
 
     def digest(index: int) -> bytes:
         try:
-            with open_regular(paths[index], None) as file:  # a piece at a time
+            with open_regular(paths[index], None) as file:  # in chunks
                 return hashlib.file_digest(file, "sha256").digest()
         except OSError as error:
             raise InputError(f"{paths[index]} cannot be read: {error.strerror}. Check its permissions.") from error
@@ -149,7 +148,7 @@ def _hash_of_contents(photographs: Sequence[Photograph], label: str) -> str:
 def _write(photographs: list[Photograph], downscale: int, contents: str | None, label: str, target: Path) -> Header:
     """Decode everything into the file `target`.
 
-    The threads write to the file and not through a mapping of it, so no picture stays in this process's memory.
+    The threads write to the file and not through a mapping, so no picture stays in this process's memory.
     """
     sizes = _sizes(photographs, downscale, label)
     masked = any(photograph.mask is not None or photograph.radius is not None for photograph in photographs)
@@ -179,7 +178,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
 
 
 def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tuple[int, int]]:
-    """Return the shrunk (width, height) of each, from the headers; masks are compared on the way."""
+    """Return the shrunk (width, height) of each from the headers, and compare masks with them."""
 
     def size(index: int) -> tuple[int, int]:
         path, mask = photographs[index].path, photographs[index].mask
@@ -197,7 +196,7 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
 
 
 def of_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether two sizes are the same, or one is the other resized; nearly the same is cropped."""
+    """Return whether two sizes are equal, or one is the other resized; nearly equal sizes are crops."""
     (width, height), (across, down) = size, other
     rounding = 0.5 * max(width + height, across + down)
     resized = not LEAST_RESIZED < width / across < 1 / LEAST_RESIZED
@@ -229,17 +228,17 @@ def _mask(
 
 
 def _mask_of(photograph: Photograph, mask: Path, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-    """Return a photograph's mask at its own size, turned as the photograph is (`size`)."""
+    """Return a photograph's mask at its own size, rotated like the photograph (`size`)."""
     header = read_header(mask)
     as_shown = photograph.upright and not of_one_shape(header.size, size)
     kept = read_mask(mask, photograph.mask_keeps or "white", as_shown)
-    if as_shown and header.orientation == 1:  # programs that make masks may drop the tag
+    if as_shown and header.orientation == 1:  # programs that write masks may drop the tag
         kept = TURNED[read_header(photograph.path).orientation](kept)
     return kept
 
 
 def _resized(kept: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-    """Return a mask at a size (width, height), by its nearest pixels."""
+    """Return a mask resized to (width, height) by nearest neighbor."""
     if kept.shape == size[::-1]:
         return kept
     row, column = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size[::-1], kept.shape, strict=True))
@@ -247,7 +246,7 @@ def _resized(kept: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.nd
 
 
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:
-    """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbor."""
+    """Refuse a file that has changed since its header was read: it would overwrite its neighbor."""
     if (pixels.shape[1], pixels.shape[0]) != size:
         raise InputError(f"{path} changed while it was read. Try again when it is complete.")
 
@@ -255,8 +254,8 @@ def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> N
 def photograph_hashes(pixels: PixelStore) -> Int[Tensor, "views"]:
     """Return a hash (BLAKE2b, 64 bits) of each view's pixels and mask, as they are trained on.
 
-    Of more than 4 GiB every k-th row counts, 256 MiB in all: a photograph that was exposed, sharpened or cropped anew
-    is found, and one that was retouched in a few rows may not be.
+    Beyond 4 GiB only every k-th row counts, 256 MiB in total: a photograph whose exposure, sharpness or crop changed is
+    detected, and one that was retouched in a few rows may not be.
     """
     total = num_bytes(pixels)
     step = 1 if total <= CHECKED_WHOLE else -(-total // THINNED)

@@ -6,16 +6,16 @@ from jaxtyping import Bool, UInt8
 from nerf_lightning.messages.errors import InputError
 
 PIXELS_AT_ONCE = 1 << 16
-"""That are shrunk together: what is computed of them stays in the cache."""
+"""Number of pixels shrunk together: intermediate results fit into the cache."""
 MOST_IN_32_BITS = (2**32 - 1) // (255 * (2 * 255 + 1))
-"""Pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
+"""Maximum number of pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
     """Return (width, height) of a photograph shrunk by a whole factor that need not divide its size.
 
-    What is left over at the right and at the bottom is cropped, so that focal length and principal point, which is
-    measured from the upper left corner, are divided by `factor` exactly.
+    The remainder at the right and at the bottom is cropped, so that focal length and principal point, which is measured
+    from the upper left corner, are divided by exactly `factor`.
 
     >>> downscaled_size(1081, 720, 4)
     (270, 180)
@@ -32,13 +32,13 @@ def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
 
 
 def crop_to_multiple(picture: UInt8[np.ndarray, "height width *c"], factor: int) -> UInt8[np.ndarray, "h w *c"]:
-    """Return the picture without the rows at the bottom and columns at the right that `factor` leaves over."""
+    """Return the picture without the remaining rows at the bottom and columns at the right."""
     height, width = (side // factor * factor for side in picture.shape[:2])
     return picture[:height, :width]
 
 
 def whole_blocks(kept: Bool[np.ndarray, "height width"], factor: int) -> Bool[np.ndarray, "h w"]:
-    """Return which blocks of `factor` x `factor` pixels are kept altogether; the rest of the picture is cropped."""
+    """Return which blocks of `factor` x `factor` pixels are kept entirely; the rest of the picture is cropped."""
     height, width = (side // factor for side in kept.shape)
     blocks = kept[: height * factor, : width * factor].reshape(height, factor, width, factor)
     return np.asarray(blocks.all(axis=(1, 3)))
@@ -65,10 +65,10 @@ def area_downscale(
 def _block_means(rgba: UInt8[np.ndarray, "height width 4"], factor: int) -> UInt8[np.ndarray, "h w 4"]:
     height, width, area = rgba.shape[0] // factor, rgba.shape[1] // factor, factor**2
     blocks = rgba.reshape(height, factor, width, factor, 4)
-    # One pixel of each block at a time keeps the temporaries at the size of the small picture.
+    # Processing one pixel of each block at a time keeps the temporaries at the size of the small picture.
     parts = (blocks[:, row, :, column] for row in range(factor) for column in range(factor))
     total = np.zeros((height, width, 4), dtype=np.uint32 if area <= MOST_IN_32_BITS else np.uint64)
-    if (rgba[..., 3] == 255).all():  # all weights are alike: the same means with a fraction of the work
+    if (rgba[..., 3] == 255).all():  # all weights are equal: the same means with a fraction of the work
         for part in parts:
             total += part
         return ((2 * total + area) // (2 * area)).astype(np.uint8)

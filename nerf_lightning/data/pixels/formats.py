@@ -1,4 +1,4 @@
-"""Formats of picture files: which decoders a file may reach, and what to do about formats that none of them reads."""
+"""Formats of picture files: the decoders that may be used, and what to do about formats that none of them reads."""
 
 from functools import cache
 from importlib import import_module
@@ -6,7 +6,7 @@ from importlib import import_module
 from PIL import features
 
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "AVIF", "HEIF")
-"""A closed list: some of PIL's other decoders start outside programs."""
+"""A closed list: some of PIL's other decoders start external programs."""
 HEIC_ENDINGS = (".heic", ".heif", ".hif")
 HEIC_KINDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 HEIC_CURE = (
@@ -23,7 +23,7 @@ EXR_CURE = (
     "-colorspace sRGB -format png *.exr`), and give their folder."
 )
 UNREAD = dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), RAW_CURE) | {".exr": EXR_CURE}
-"""Endings, and what to do about such files. Most RAW files are TIFFs to PIL, which would read a small preview."""
+"""Extensions, and what to do about such files. PIL reads most RAW files as TIFFs with only a small preview."""
 
 
 @cache
@@ -35,7 +35,7 @@ def decoders() -> tuple[str, ...]:
             heif = import_module(name)
         except ImportError:
             continue
-        # The picture alone, without thumbnails, depth maps and gain maps.
+        # Only the picture, without thumbnails, depth maps and gain maps.
         heif.register_heif_opener(thumbnails=False, depth_images=False, aux_images=False)
         break
     else:

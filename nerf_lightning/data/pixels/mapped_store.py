@@ -1,7 +1,7 @@
-"""Pixel stores as files that are mapped into memory: they may be larger than it, and processes share one copy.
+"""Pixel stores as memory-mapped files: they may be larger than memory, and processes share one copy.
 
-KEY.pixels holds the RGBA of every view and then, where there are masks, a byte per pixel. KEY.json is written last and
-says what the other file is: without it, or where the two disagree, nothing is believed.
+KEY.pixels contains the RGBA of every view, followed, if there are masks, by a byte per pixel. KEY.json is written last
+and describes the other file: without it, or if the two disagree, the store is not used.
 """
 
 import json
@@ -32,8 +32,8 @@ from nerf_lightning.nerf.types.scene import PixelStore
 FORMAT = 3
 SPOTS, SPOT_BYTES = 64, 4096
 CHECKED_WHOLE = 1 << 32
-"""Bytes of a file that is compared with its checksum at each start (0.4 s a gigabyte of what memory holds); of larger
-ones, which may be more than it holds, only spots are, unless contents are to be compared."""
+"""Maximum size in bytes of files that are compared with their checksum at each start (0.4 s per gigabyte in memory); of
+larger ones, which may exceed memory, only spots are checked, unless contents are to be compared."""
 PIECE = 1 << 24
 LONGEST_SIDE = 1 << 24
 GIGABYTE = 1e9
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Header:
-    """What a file of pixels holds."""
+    """Description of a file of pixels."""
 
     format: int
     sizes: list[list[int]]
@@ -51,15 +51,15 @@ class Header:
     has_transparency: bool
     masked: bool
     contents: str | None
-    """Hash of the pictures that it was made from, where they were hashed."""
+    """Hash of the source pictures, if they were hashed."""
     spots: int
-    """Checksum of a few evenly spread spots: finds what a crash of the machine left unwritten."""
+    """Checksum of a few evenly spread spots: detects what a machine crash left unwritten."""
     checksum: int
-    """Of all bytes (CRC-32): finds what a failing disk has changed."""
+    """Of all bytes (CRC-32): detects what a failing disk has changed."""
 
     @property
     def num_pixels(self) -> int:
-        """Pixels of all views."""
+        """Total number of pixels in all views."""
         return sum(width * height for width, height in self.sizes)
 
     @property
@@ -70,35 +70,35 @@ class Header:
 
 @dataclass(frozen=True)
 class MappedPixelStore(PixelStore):
-    """A store whose arrays are a file's. Pickled, it is a name: another process maps the same file."""
+    """A store whose arrays map a file. It is pickled as a path: another process maps the same file."""
 
     path: Path = field(kw_only=True)
     header: Header = field(kw_only=True)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Send the path, not the pixels, which may be more than memory holds."""
+        """Pickle the path, not the pixels, which may exceed memory."""
         return _mapped, (self.path, self.header)
 
 
 def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> PixelStore:
-    """Return the store at `base`, or make it there first.
+    """Return the store at `base`, creating it if necessary.
 
-    Of several processes that ask at once, one makes and the others wait. A damaged store is made again.
+    If several processes call this at once, one makes the store and the others wait. A damaged store is made again.
 
     Args:
-        base: the files without their endings.
+        base: path of the files without their extensions.
         contents: hash of the pictures; a store made from others, or never hashed, is made again. None: not compared.
-        make: writes the pixels to the path it is given and describes them; the checksums are filled in here.
+        make: writes the pixels to the given path and describes them; the checksums are filled in here.
 
     Raises:
-        InputError: the folder cannot be written, or others can write there, too.
+        InputError: the folder is not writable, or others can write to it, too.
     """
     try:
         make_own_folder(base.parent)
         header = _sound_header(base, contents)
         if header is None:
             with FileLock(base.with_suffix(".lock")):
-                # Another process may have made it meanwhile.
+                # Another process may have made it in the meantime.
                 header = _sound_header(base, contents) or _make(base, make)
     except OSError as error:
         raise InputError(
@@ -109,7 +109,7 @@ def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> 
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
-    """Refuse to start what the disk cannot hold."""
+    """Refuse to write more than fits on the disk."""
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
         raise InputError(
@@ -120,7 +120,7 @@ def check_room(folder: Path, num_bytes: int) -> None:
 
 
 def _make(base: Path, make: Callable[[Path], Header]) -> Header:
-    """Write the pixels, and the header once they have their name."""
+    """Write the pixels, and the header once the file has its final name."""
     path, about = base.with_suffix(".pixels"), base.with_suffix(".json")
     with whole_file(about, mode=0o600) as note, whole_file(path, mode=0o600) as part:
         header = make(part)
@@ -132,7 +132,7 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
 
 
 def _sound_header(base: Path, contents: str | None) -> Header | None:
-    """Return the header of a store that is whole and up to date, else None."""
+    """Return the header of a complete, up-to-date store, else None."""
     path = base.with_suffix(".pixels")
     try:
         with open_own(base.with_suffix(".json"), "json") as file:
@@ -156,7 +156,7 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
 
 
 def _require_numbers(header: Header) -> None:
-    """Refuse sizes that are none: offsets into the file follow from them."""
+    """Refuse invalid sizes: offsets into the file follow from them."""
     sizes_fit = all(
         len(size) == 2 and all(type(side) is int and 0 < side < LONGEST_SIDE for side in size) for size in header.sizes
     )
@@ -165,7 +165,7 @@ def _require_numbers(header: Header) -> None:
 
 
 def _spots(path: Path) -> int:
-    """Return the checksum of evenly spread spots of a file, its first and last bytes among them."""
+    """Return the checksum of evenly spread spots of a file, including its first and last bytes."""
     checksum = 0
     last = max(0, path.stat().st_size - SPOT_BYTES)
     with open_own(path, None) as file:
@@ -185,7 +185,7 @@ def _checksum(path: Path) -> int:
 
 
 def _mapped(path: Path, header: Header) -> MappedPixelStore:
-    """Return the store as views of the file; what is written to them stays in this process."""
+    """Return the store as views of the file; writes to them stay in this process."""
     bytes_ = _mapped_bytes(path)
     rgba = bytes_[: 4 * header.num_pixels].view(-1, 4)
     sizes = [(width, height) for width, height in header.sizes]
@@ -206,14 +206,15 @@ def _mapped(path: Path, header: Header) -> MappedPixelStore:
 def _mapped_bytes(path: Path) -> UInt8[Tensor, "bytes"]:
     with open_own(path, None) as file:
         if sys.platform == "linux":
-            # A private mapping counts as memory that might be written, all of it, and a file larger than the machine's
-            # memory would be refused. Nobody writes, so none is reserved. Python knows the flag's number from 3.13 on.
+            # All of a private mapping counts as memory that might be written, so a file larger than the machine's
+            # memory would be refused. Nothing writes to it, so no memory is reserved. Python has the flag's number
+            # since 3.13.
             generic = 0x4000 if platform.machine() in ("x86_64", "aarch64") else 0
             flags = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", generic)
             mapping = mmap.mmap(file.fileno(), 0, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
         else:
             mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if hasattr(mmap, "MADV_RANDOM"):
-        # Batches take single pixels from all over the file: reading ahead would only push others out.
+        # Batches read single pixels from all over the file: reading ahead would only evict others.
         mapping.madvise(mmap.MADV_RANDOM)
     return torch.frombuffer(mapping, dtype=torch.uint8)

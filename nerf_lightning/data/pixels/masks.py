@@ -1,4 +1,4 @@
-"""Which pixels of a photograph a mask keeps."""
+"""Read which pixels of a photograph a mask keeps."""
 
 from pathlib import Path
 from typing import Literal
@@ -11,21 +11,21 @@ from nerf_lightning.messages.errors import InputError
 
 KEEP_ABOVE = 127
 MOST_LEVELS = 16
-"""Of green in a mask that is no cut-out photograph, at most."""
+"""Maximum number of green levels in a mask that is not a cut-out photograph."""
 MaskColor = Literal["white", "black"]
 
 
 def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels a picture keeps: the white ones or, where black is kept, the others.
+    """Return which pixels a mask keeps: the white ones or, if black is kept, the others.
 
-    White is brighter than 127 of 255; of two values on one side of that the larger one is, and 1 alone is white.
-    Where alpha, or red, is all that differs from pixel to pixel, it is the mask; of a cut-out photograph alpha is.
+    White is brighter than 127 of 255; of two values on the same side of that, the larger one is white, and 1 alone is
+    white. If only alpha, or red, differs between pixels, it is the mask; of a cut-out photograph alpha is.
 
     Raises:
-        InputError: what `read_rgba` refuses, and pictures with several channels that say different things.
+        InputError: a picture that `read_rgba` refuses, or whose channels disagree.
     """
     rgba = read_rgba(path, upright, converts_colors=False)
-    # Of red, green, blue and alpha, those that differ from pixel to pixel.
+    # Those of red, green, blue and alpha that differ between pixels.
     said = [rgba[..., channel] for channel in range(4) if np.ptp(rgba[..., channel])]
     if np.ptp(rgba[..., 3]) and np.count_nonzero(np.bincount(rgba[..., 1].ravel())) > MOST_LEVELS:
         said = [rgba[..., 3]]

@@ -1,4 +1,4 @@
-"""Picture files to 8-bit RGBA with straight alpha, and depth maps."""
+"""Read picture files as 8-bit RGBA with straight alpha, and depth maps."""
 
 import logging
 import math
@@ -38,47 +38,47 @@ QUARTER_TURNS = (5, 6, 7, 8)
 JPEG_START, JPEG_BLOCK = b"\xff\xd8\xff", 64
 """Pixels of a block."""
 JPEG_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd9-\xfe]")
-"""Those with a length. Decoders pass over the others, which have none: restarts among the pixels (0xd0 to 0xd7), TEM
-(0x01), and what is no marker at all."""
+"""Markers with a length. Decoders skip the others, which have none: restarts among the pixels (0xd0 to 0xd7), TEM
+(0x01), and what is not a marker."""
 JPEGS = ("JPEG", "MPO")
-"""Pillow's names: the latter carries other pictures behind its own."""
+"""Pillow's names: the latter contains further pictures behind its main one."""
 ONE_PICTURE = (*JPEGS, "HEIF")
-"""Formats of which the main picture alone counts."""
+"""Formats of which only the main picture counts."""
 JPEG_SCAN, JPEG_END = 0xDA, 0xD9
 SOUND_SCANS, MOST_SCANS = 20, 100
-"""Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
+"""Scans of a progressive file; each can be a few bytes, and costs a pass over all pixels."""
 CURE = "Copy or render it again; PNG, JPEG, TIFF, WebP and AVIF are read."
 DECODER_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error),
     *(TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, AssertionError),
 )
-"""What PIL lets through of damaged files, the latter ones by mistake."""
+"""Exceptions that PIL raises for damaged files, the latter ones by mistake."""
 
 log = logging.getLogger(__name__)
 
-# Python's list of warning filters belongs to all threads at once.
+# Python's list of warning filters is shared by all threads.
 _filters = threading.Lock()
 _saying = threading.Lock()
-# Small files can announce large pictures, each of which takes gigabytes while it is decoded.
+# Small files can announce large pictures, each of which takes gigabytes to decode.
 LARGE = 40_000_000
 _one_large_picture = threading.RLock()
 
 
 class PictureHeader(NamedTuple):
-    """What a picture file says of itself before its pixels."""
+    """The header of a picture file."""
 
     size: tuple[int, int]
-    """(width, height) in pixels as they are stored."""
+    """(width, height) in pixels as stored."""
     orientation: int
-    """How the picture is to be turned for show, by EXIF: 1 (as it is stored) to 8; 1 where nothing sound is said."""
+    """EXIF orientation: 1 (as stored) to 8; 1 if there is no valid one."""
 
 
 def read_header(path: Path) -> PictureHeader:
-    """Return a picture's size and orientation; no pixel is decoded, and of a PNG nothing behind them is looked at.
+    """Return a picture's size and orientation; no pixel is decoded, and nothing behind a PNG's pixels is read.
 
     Raises:
-        InputError: the file is absent, empty, of no known format, too large to be decoded safely, holds several
-            pictures, or has a pixel mode with no plain reading as 8-bit color.
+        InputError: the file is missing, empty, of unknown format, too large to be decoded safely, contains several
+            pictures, or has a pixel mode that does not convert to 8-bit color.
     """
     with opened_picture(path) as image:
         try:
@@ -95,7 +95,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def is_heic(path: Path) -> bool:
-    """Return whether a file begins as phones' HEIC photographs do, whatever its name."""
+    """Return whether a file begins like phones' HEIC photographs, whatever its name."""
     try:
         with open_regular(path, None) as file:
             start = file.read(12)
@@ -108,15 +108,15 @@ def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
     Palettes and gray levels are expanded, and colors are converted from the file's profile to sRGB. Of 16 bits the
-    upper byte is kept (less than one level off). Both are said once for each folder.
+    upper byte is kept (less than one level off). Both are logged once per folder.
 
     Args:
         path: the file.
-        upright: turn the pixels as an EXIF tag says; false returns them as they are stored.
-        converts_colors: false takes the numbers as they are, as masks need it.
+        upright: rotate the pixels according to the EXIF tag; false returns them as stored.
+        converts_colors: false keeps the numbers unchanged, as masks require.
 
     Raises:
-        InputError: what `read_header` refuses, or damaged or truncated.
+        InputError: the file is refused by `read_header`, damaged or truncated.
     """
     with opened_picture(path) as image:
         if _is_deep(image):
@@ -130,9 +130,9 @@ def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -
             raise InputError(_unreadable(path, error)) from error
         rgba = np.empty((image.height, image.width, 4), np.uint8)
         convert = to_srgb(image, path.parent) if converts_colors else lambda part: part.convert("RGBA")
-        for rows in row_chunks(*rgba.shape[:2]):  # several copies of the whole would be held at once
+        for rows in row_chunks(*rgba.shape[:2]):  # otherwise several copies of the whole would be held at once
             part = image.crop((0, rows.start, image.width, rows.stop))
-            if part.mode in GREY_16:  # of masks, whose numbers count, the levels above 255 are white
+            if part.mode in GREY_16:  # in masks, whose numbers count, levels above 255 are white
                 levels = np.asarray(part)
                 part = Image.fromarray((levels >> 8 if converts_colors else levels.clip(max=255)).astype(np.uint8))
             rgba[rows] = np.asarray(convert(part))
@@ -140,7 +140,7 @@ def read_rgba(path: Path, upright: bool = False, converts_colors: bool = True) -
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Return whether a picture that is not decoded yet has more than 8 bits per channel."""
+    """Return whether a picture that is not yet decoded has more than 8 bits per channel."""
     return ";16" in str(getattr(image, "tile", "")) or image.info.get("bit_depth", 8) > 8
 
 
@@ -150,13 +150,13 @@ def _say_reduced(folder: Path) -> None:
 
 
 def read_depth(path: Path) -> tuple[Float32[np.ndarray, "height width"], bool]:
-    """Return a depth map as it is stored, and whether it counts levels, as sensors do, and not lengths.
+    """Return a depth map as stored, and whether it counts levels, as sensors do, instead of lengths.
 
-    It is a gray picture of 16 bits, or an array (.npy), whose whole numbers are levels. What is no depth is 0: NaN,
-    infinity and numbers below.
+    It is a 16-bit gray picture, or an array (.npy), whose integers are levels. Invalid depths (NaN, infinity and
+    negative numbers) become 0.
 
     Raises:
-        InputError: what `read_header` refuses, damaged, or of another kind.
+        InputError: the file is refused by `read_header`, damaged, or of another kind.
     """
     if path.suffix.lower() == ".npy":
         depth = np.squeeze(read_npy(path, CURE))
@@ -203,10 +203,10 @@ def opened_picture(path: Path) -> Iterator[Image.Image]:
     with ExitStack() as opened:
         try:
             file = opened.enter_context(open_regular(path, "image", CURE))
-            if file.peek(3).startswith(JPEG_START):  # Pillow joins its EXIF in quadratic time
+            if file.peek(3).startswith(JPEG_START):  # Pillow concatenates its EXIF in quadratic time
                 file = opened.enter_context(_JpegHeader(file, path))
             with _filters, warnings.catch_warnings():
-                # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
+                # PIL warns at a number of pixels and fails at twice that; a single limit is easier to explain.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
                 Image.MAX_IMAGE_PIXELS = limits().megapixels * 500_000
                 image = opened.enter_context(Image.open(file, formats=decoders()))
@@ -224,10 +224,10 @@ def opened_picture(path: Path) -> Iterator[Image.Image]:
 
 
 def _check_jpeg(image: Image.Image, file: BufferedReader, path: Path) -> None:
-    """Refuse a JPEG whose decoder would make up most of its pixels, or go over them again and again."""
+    """Refuse a JPEG whose decoder would make up most of its pixels, or process them again and again."""
     width, height = image.size
     size = os.fstat(file.fileno()).st_size
-    # It has a bit at least for each block of them.
+    # It has at least one bit per block.
     if 8 * size * JPEG_BLOCK < width * height:
         raise InputError(
             f"{path} claims {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. {CURE}"
@@ -242,7 +242,7 @@ def _check_jpeg(image: Image.Image, file: BufferedReader, path: Path) -> None:
 
 
 def jpeg_scans(content: bytes | mmap.mmap) -> int:
-    """Return how many times a JPEG goes over its pixels; what comes behind its end is not counted."""
+    """Return the number of scans in a JPEG; what follows its end is not counted."""
     place, scans = 2, 0
     while found := JPEG_MARKER.search(content, place):
         marker, place = content[found.end() - 1], found.end()
@@ -254,8 +254,8 @@ def jpeg_scans(content: bytes | mmap.mmap) -> int:
 
 
 def _check_plain(image: Image.Image, path: Path) -> None:
-    """Refuse several pictures in one file, and pixel modes that are no 8-bit color."""
-    # What a JPEG or HEIC carries beside its own picture (previews, depth) is none; counting pages would read them all.
+    """Refuse several pictures in one file, and pixel modes that are not 8-bit color."""
+    # Extra pictures of a JPEG or HEIC (previews, depth) do not count; counting pages would read them all.
     if image.format not in ONE_PICTURE and getattr(image, "is_animated", False):
         raise InputError(
             f"{path} holds several pictures (an animation, or pages), and it is unclear which one is meant. Save each "
@@ -269,7 +269,7 @@ def _check_plain(image: Image.Image, path: Path) -> None:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    """Say what is wrong with the file itself."""
+    """Return what is wrong with the file itself."""
     if path.is_file() and path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). {CURE}"
     if is_heic(path):

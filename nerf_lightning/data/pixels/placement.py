@@ -1,4 +1,4 @@
-"""Where the pixels lie while training: in memory, in a mapped file, or on the device where they fit."""
+"""Where pixels are during training: in memory, in a mapped file, or on the device if they fit."""
 
 from dataclasses import replace
 from typing import Literal
@@ -14,24 +14,24 @@ from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9
 AUTO_SHARE = 0.5
-"""Of the device's free memory: the rest is for tables, activations and evaluation."""
+"""Share of the device's free memory: the rest is for tables, activations and evaluation."""
 CHUNK_BYTES = 1 << 26
 
 
 def num_bytes(pixels: PixelStore) -> int:
-    """Return how much room the pixels take, with their masks."""
+    """Return the number of bytes of the pixels and their masks."""
     return pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
 
 
 def budget_bytes(budget: int | float | Literal["auto"], device: torch.device) -> int:
-    """Return how much of the device's memory the pixels may take: gigabytes, or half of what is free."""
+    """Return how much device memory the pixels may take: `budget` gigabytes, or half of what is free."""
     if budget != "auto":
         return int(budget * GIGABYTE)
     return int(AUTO_SHARE * free_memory(device)) if device.type == "cuda" else 0
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:
-    """Return the scene with pixels, cameras, near and far on the device; a mapped file is read once, part by part."""
+    """Return the scene with pixels, cameras, near and far on the device; a mapped file is read once, in parts."""
     pixels = scene.pixels
     columns = ("{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with progress_bar(*columns, shown=num_bytes(pixels) > 16 * CHUNK_BYTES) as bar:
@@ -58,7 +58,7 @@ def on_device(scene: Scene, device: torch.device) -> Scene:
 
 
 def sent(tensor: Shaped[Tensor, "..."], device: torch.device) -> Shaped[Tensor, "..."]:
-    """Return the tensor on the device; to a GPU by way of pinned memory, so that the host need not wait for it."""
+    """Return the tensor on the device; to a GPU via pinned memory, so that the host need not wait."""
     if device.type == "cuda":
         return tensor.pin_memory().to(device, non_blocking=True)
     return tensor.to(device)

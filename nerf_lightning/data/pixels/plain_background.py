@@ -1,4 +1,4 @@
-"""Photographs of a thing before one plain color, without alpha: the color is found, and made transparent."""
+"""Make the plain background of photographs without alpha transparent."""
 
 import hashlib
 import logging
@@ -23,27 +23,27 @@ Color = tuple[int, int, int]
 TOLERANCE = 2
 """Levels of 255 by which a pixel of the background may be off."""
 EDGE_SHARE, VIEW_SHARE = 0.9, 0.9
-"""So much of a photograph's edge has the color, and so many of the photographs are such."""
+"""Minimum share of a photograph's edge that has the color, and of photographs with such an edge."""
 LEAST_SHARE = 0.1
-"""Of the pixels that the background has; less is a frame around the pictures."""
+"""Minimum share of the pixels in the background; less is a frame around the pictures."""
 ALIKE = 0.9
-"""What is transparent in all photographs over what is in any: from here on it is a frame around the pictures."""
+"""Ratio of pixels transparent in all photographs to those in any: from here on it is a frame around the pictures."""
 LOOKED_AT, THUMBNAIL = 32, 128
 
 log = logging.getLogger(__name__)
 
 
 def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Color | None]:
-    """Return the photographs with the plain background made transparent, and its color; as they are if there is none.
+    """Return the photographs with the plain background made transparent, and its color; unchanged if there is none.
 
-    Transparent is what has the color and hangs together with the picture's edge, so that a thing of the same color
-    within the content stays. Colors are not changed: over a background of that color the photographs look as before,
-    to a level of 255. A store in memory is written to; of a mapped one another is made beside it.
+    Pixels become transparent if they have the color and are connected to the picture's edge, so that content of the
+    same color stays. Colors are not changed: over a background of that color the photographs look as before, to a level
+    of 255. A store in memory is modified; for a mapped one another is made next to it.
 
     Args:
         pixels: of one scene.
         name: of the scene, for messages.
-        wanted: false returns the photographs as they are.
+        wanted: false returns the photographs unchanged.
     """
     color = plain_color(pixels) if wanted else None
     if color is None:
@@ -64,7 +64,7 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
 
 
 def in_words(color: Color) -> str:
-    """Return a color as people say it.
+    """Return a color in words.
 
     >>> in_words((255, 254, 255)), in_words((0, 0, 2)), in_words((90, 120, 90))
     ('white', 'black', 'rgb(90, 120, 90)')
@@ -75,15 +75,15 @@ def in_words(color: Color) -> str:
 
 
 def protocol_of(color: Color | None) -> dict[str, str]:
-    """Return what a measured number says of it."""
+    """Return its entry in the protocol of measured numbers."""
     return {} if color is None else {"cut_out": in_words(color)}
 
 
 def background_for(asked: str | None, color: Color | None, otherwise: Background) -> Background:
-    """Return the background that was asked for; None: `otherwise`, or what suits the color that was cut out.
+    """Return the background `asked` for; None: `otherwise`, or what suits the color that was cut out.
 
-    Before one color throughout, sheets of that color may grow before the content until nothing else is left; drawn
-    anew for each ray, backgrounds forbid them.
+    With a constant background, sheets of its color may grow in front of the content until nothing else is left; a
+    random background per ray prevents them.
     """
     if asked is not None:
         return known_background(asked)
@@ -94,11 +94,11 @@ def background_for(asked: str | None, color: Color | None, otherwise: Background
 
 
 def plain_color(pixels: PixelStore) -> Color | None:
-    """Return the one color that lies behind the content of all photographs; None where there is no such thing.
+    """Return the one color behind the content of all photographs; None if there is none.
 
     It is the color of nearly all edges. A frame that is the same in all photographs, such as a lens's dark rim or a
-    film's black bars, is no background; nor is anything in photographs that have alpha or masks, whose makers have said
-    what counts.
+    film's black bars, is not a background; nor is anything in photographs with alpha or masks, whose authors have
+    marked what counts.
     """
     if pixels.has_transparency or pixels.mask is not None:
         return None
@@ -125,7 +125,7 @@ def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
 
 
 def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels have the plain color and reach the edge through such pixels."""
+    """Return which pixels have the plain color and are connected to the edge through such pixels."""
     from scipy import ndimage
 
     parts, count = ndimage.label(plain)
@@ -143,10 +143,10 @@ def _behind_thumbnail(pixels: PixelStore, view: int, color: Color) -> Bool[Tenso
 
 
 def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.ndarray, "height width"]:
-    """Return alpha: 0 behind the content, 255 within it, and `UNSURE` where a pixel may have some of the background.
+    """Return alpha: 0 behind the content, 255 within it, and `UNSURE` where a pixel may contain background.
 
-    Of pixels along the outline that is a part; holes through the content show nothing else. Both may as well be content
-    of that color.
+    Pixels along the outline contain some; holes through the content show nothing else. Both may also be content of that
+    color.
     """
     from scipy import ndimage
 

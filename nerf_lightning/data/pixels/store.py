@@ -17,7 +17,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import PixelStore
 
-# Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.
+# Decoding releases the GIL. Each thread holds one picture: this bounds the memory besides the store.
 MAX_THREADS = 4
 NOTICEABLE = 50
 
@@ -27,14 +27,14 @@ Result = TypeVar("Result")
 def layout(
     sizes: Sequence[tuple[int, int]],
 ) -> tuple[Int[Tensor, "views"], Int[Tensor, "views"], Int[Tensor, "views"]]:
-    """Return offset, width and height of pictures that lie one after the other; sizes are (width, height)."""
+    """Return offset, width and height of concatenated pictures; sizes are (width, height)."""
     width, height = torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2).unbind(dim=1)
     area = width * height
     return area.cumsum(dim=0) - area, width, height
 
 
 def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
-    """Return a store with room for opaque pictures of these sizes (width, height), its pixels not yet written."""
+    """Return an uninitialized store for opaque pictures of these sizes (width, height)."""
     num_pixels = sum(width * height for width, height in sizes)
     free = free_memory()
     if 4 * num_pixels > free:
@@ -46,7 +46,7 @@ def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
 
 
 def in_threads(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
-    """Return work(0), work(1), ... up to `count`, done by a few threads under a progress bar where one is `shown`."""
+    """Return [work(0), ..., work(count - 1)], computed by a few threads, with a progress bar if `shown`."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     threads = min(MAX_THREADS, num_cores())
     with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
@@ -54,7 +54,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
 
 
 class UndecodableError(InputError):
-    """Photographs that cannot be decoded, or masks that do not fit them: by number, what is wrong with each."""
+    """Photographs that cannot be decoded, or masks that do not fit them: what is wrong with each, by index."""
 
     def __init__(self, faults: dict[int, str]):
         super().__init__(next(iter(faults.values())))
@@ -62,7 +62,7 @@ class UndecodableError(InputError):
 
 
 def each_or_faults(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
-    """Return what `in_threads` does, and name all that are refused, not the first alone."""
+    """Return what `in_threads` does, and report all failures, not only the first."""
     faults: dict[int, str] = {}
 
     def tried(index: int) -> Result | None:

@@ -1,4 +1,4 @@
-"""A capture of whatever format: the files in its folder, or in one just below or above, tell which."""
+"""Read a capture of any known format: the files in its folder, or in one just below or above, determine it."""
 
 import importlib
 import inspect
@@ -27,15 +27,15 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
 FIRST: tuple[type[CaptureReader], ...] = (BlenderReader, TransformsReader, ColmapReader, LlffReader)
-"""Where a folder has the files of several, the first says more: a COLMAP model has lenses and points, which
-poses_bounds.npy beside it lacks."""
+"""If a folder has the files of several, the first one says more: a COLMAP model has lenses and points, which the
+poses_bounds.npy next to it lacks."""
 
 log = logging.getLogger(__name__)
 
 
 @cache
 def readers() -> tuple[type[CaptureReader], ...]:
-    """Return the readers whose formats are known by files: `FIRST`, then the others that yamls in `scene/` name."""
+    """Return the readers of formats recognized by files: `FIRST`, then the others that YAMLs in `scene/` name."""
     texts = (conf_file(f"scene/{name}").read_text(encoding="utf-8") for name in option_names("scene"))
     targets = (str(yaml.safe_load(text)["_target_"]).rpartition(".") for text in texts)
     classes = (getattr(importlib.import_module(module), name) for module, _, name in targets)
@@ -49,24 +49,24 @@ def readers() -> tuple[type[CaptureReader], ...]:
 
 @dataclass(frozen=True)
 class Known:
-    """A folder whose format is known."""
+    """A folder of known format."""
 
     folder: Path
     file: str
-    """That tells the format."""
+    """The file that determines the format."""
     reader: type[CaptureReader]
 
     @property
     def scene(self) -> str:
-        """How scene= names the format."""
+        """Name of the format for scene=."""
         return str(inspect.signature(self.reader).parameters["name"].default)
 
 
 @dataclass
 class AutoReader(CaptureReader):
-    """Read a folder as the format that its files tell.
+    """Read a folder in the format that its files determine.
 
-    Settings that are left as they are have the values that the format's own reader has.
+    Settings left at their defaults have the defaults of the format's own reader.
 
     Args:
         images: the folder of the photographs below root; null: the format's own.
@@ -77,10 +77,10 @@ class AutoReader(CaptureReader):
     images: str | None = None
 
     def read(self) -> Scene:
-        """Return the capture, as the format's own reader does.
+        """Return the capture like the format's own reader.
 
         Raises:
-            InputError: no known format, a setting that the format does not have, or anything wrong with the files.
+            InputError: the format is unknown or does not have a setting, or anything is wrong with the files.
         """
         return self.reader().read()
 
@@ -89,14 +89,14 @@ class AutoReader(CaptureReader):
         return named_folder(self.root)
 
     def capture(self) -> Capture:
-        """Return what the format says."""
+        """Return the content of the files."""
         return self.reader().capture()
 
     def reader(self) -> CaptureReader:
-        """Return the reader of the format, and say which it is.
+        """Return the reader of the format, and log which it is.
 
         Raises:
-            InputError: no known format, or a setting that the format does not have.
+            InputError: the format is unknown, or does not have a setting.
         """
         known = self._search()
         root = self.root if known.folder == self.folder() else str(known.folder)
@@ -110,20 +110,20 @@ class AutoReader(CaptureReader):
                 f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it out."
             )
         reader = known.reader(**chosen)
-        if not os.path.isfile(Path(self.root).expanduser()):  # a file may be a part of what its reader looks for
+        if not os.path.isfile(Path(self.root).expanduser()):  # a file may be a part of what its reader searches for
             reader.found_folder = known.folder
         return reader
 
     @staticmethod
     def known_format(folder: Path) -> Known | None:
-        """Return what a folder itself is; None for no known format."""
+        """Return what a folder itself is; None if its format is unknown."""
         for reader in readers():
             if (file := reader.found_in(folder)) is not None:
                 return Known(folder, file, reader)
         return None
 
     def _search(self) -> Known:
-        """Return what the folder is, or the one capture below it, or the one that it is a part of."""
+        """Return the folder's own format, or the only capture below it, or the one that contains it."""
         folder = self.folder()
         if (named := self._named_file()) is not None:
             return named
@@ -141,7 +141,7 @@ class AutoReader(CaptureReader):
         )
 
     def _named_file(self) -> Known | None:
-        """Return the reader of the very file that the user has named, where that is one of a capture."""
+        """Return the reader of the file that the user named, if it belongs to a capture."""
         path = Path(self.root).expanduser()
         fitting = [reader for reader in readers() if path.suffix.lower() in reader.named_by]
         if not fitting or not os.path.isfile(path):
@@ -152,13 +152,13 @@ class AutoReader(CaptureReader):
         return Known(self.folder(), path.name, reader)
 
     def _hint(self) -> str:
-        """Say what program has written the folder, where that is clear, and how its captures are read."""
+        """Return which program wrote the folder, if that is clear, and how to read its captures."""
         folder = self.folder()
         fitting = (words for files, words in OF_OTHERS if all(file_with(folder, file) for file in files))
         return next((f" {words}" for words in fitting), "")
 
     def _chosen(self) -> dict[str, Any]:
-        """Return the settings that say something."""
+        """Return the settings that differ from their defaults."""
         values = {field.name: (getattr(self, field.name), field.default) for field in fields(AutoReader)}
         return {name: value for name, (value, default) in values.items() if value != default}
 
@@ -226,8 +226,8 @@ OF_OTHERS: tuple[tuple[tuple[Signature, ...], str], ...] = (
     ((("*.zip", ""),), "A zip archive is not read: unpack it, and give what it holds."),
     ((("*.glb", ""),), "A .glb is a finished model: give the photographs, or an export of its cameras."),
 )
-"""What captures of other programs that are not read are known by, and what to do with them.
+"""How to recognize captures of other programs that are not read, and what to do with them.
 
-Each row: the signatures that a folder must have, all of them, and the words. Formats that an extension reads stand in
-its reader.
+Each row: the signatures that a folder must have, all of them, and the advice. Formats that an extension reads are
+listed in its reader.
 """

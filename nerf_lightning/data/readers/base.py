@@ -11,17 +11,17 @@ class Reader(ABC):
     """Read a capture. The constructor only keeps its arguments; every file access happens in `read`."""
 
     named_by: ClassVar[tuple[str, ...]] = ()
-    """Endings of files of this format that `scene=auto scene.root=FILE` may name."""
+    """Extensions of files of this format that `scene=auto scene.root=FILE` may name."""
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it; formats that are not searched: None."""
+        """Return the file by which this format is recognized; None if absent, or if the format is not searched for."""
         return None
 
     @abstractmethod
     def read(self) -> Scene:
-        """Return the whole capture, all splits.
+        """Return the whole capture with all splits.
 
         Raises:
-            InputError: anything wrong with the files, with the file's name and the cure.
+            InputError: anything is wrong with the files; the message names the file and the cure.
         """

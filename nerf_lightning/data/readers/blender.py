@@ -1,4 +1,4 @@
-"""The Blender format of the original method: `transforms_{train,val,test}.json` beside RGBA pictures."""
+"""The Blender format of the original method: `transforms_{train,val,test}.json` next to RGBA pictures."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -45,12 +45,12 @@ class BlenderReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         path = _file_of(folder, "train")
         return None if path is None or FrameFile.read(path, FORMAT).is_photographed else path.name
 
     def folder(self) -> Path:
-        """Return the capture's folder; where `root` has the files, what their pictures look like does not matter."""
+        """Return the capture's folder; if `root` has the files, their pictures are not examined."""
         named = named_folder(self.root)
         return named if _file_of(named, "train") else super().folder()
 
@@ -63,15 +63,15 @@ class BlenderReader(CaptureReader):
             check_step(f"skip.{split}", step)
 
     def protocol(self, judged_by: str) -> dict[str, str]:
-        """Return what measured numbers depend on: which views are judged, and how many of them are skipped."""
+        """Return what measured numbers depend on: which views are the test views, and how many of them are skipped."""
         frames = {} if self.frames is None else {"frames": self.frames}
         return {"test_views": judged_by, "test_skip": str((self.skip or {}).get(judged_by, 1))} | frames
 
     def capture(self) -> Capture:
-        """Return the views of train, val and test, in this order; a split may have none."""
+        """Return the views of train, val and test, in this order; a split may be empty."""
         root = self.folder()
         files = {split: path for split in SPLITS if (path := _file_of(root, split))}
-        files.setdefault("train", root / "transforms_train.json")  # whoever opens it says what is wrong
+        files.setdefault("train", root / "transforms_train.json")  # opening it reports what is wrong
         read = {split: FrameFile.read(path, FORMAT) for split, path in files.items()}
         say_of_files(list(read.values()))
         left_out, every = LeftOut(str(files["train"])), self.skip or {}
@@ -96,7 +96,7 @@ def _file_of(root: Path, split: str) -> Path | None:
 
 
 def _of_one_size(capture: Capture) -> Capture:
-    """Return the views whose pictures have the most frequent (width, height): others were not rendered with these."""
+    """Return the views whose pictures have the most frequent (width, height): others were rendered separately."""
     sizes = [upright_size(view.photograph) for view in capture.views]
     usual = max(count := Counter(sizes), key=count.__getitem__, default=(0, 0))
     for view, size in zip(capture.views, sizes, strict=True):
@@ -111,7 +111,7 @@ def _of_one_size(capture: Capture) -> Capture:
 
 
 def _shortest(views: list[tuple[str, str]]) -> list[str]:
-    """Return the shortest names that tell (split, path) apart: stem, split/stem, the path, or split/path.
+    """Return the shortest names that distinguish (split, path): stem, split/stem, the path, or split/path.
 
     >>> _shortest([("train", "./a/r_0.png"), ("test", "b/r_0")])
     ['train/r_0', 'test/r_0']

@@ -1,4 +1,4 @@
-"""COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, beside a folder of photographs."""
+"""COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, next to a folder of photographs."""
 
 import logging
 import os
@@ -33,7 +33,7 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import flip_yz, rotation_from_quaternion
 
 MODEL_FOLDERS = ("sparse", "", "colmap/sparse", "colmap", "colmap_text", "distorted/sparse")
-"""Where models lie below a capture's folder, or in folders of these, the likeliest first."""
+"""Folders with models, or with folders of models, below a capture's folder, the likeliest first."""
 FILES = ("cameras", "images", "points3D")
 KINDS: dict[str, BinaryFiles | TextFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
 NO_POINTS = ColmapPoints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
@@ -44,11 +44,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """What the three files say."""
+    """The content of the three files."""
 
     cameras: dict[int, ColmapCamera]
     images: tuple[ColmapImage, ...]
-    """In order of their names."""
+    """Sorted by name."""
     points: ColmapPoints
 
 
@@ -68,12 +68,12 @@ class ColmapReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the model by which this format is known, where a folder has one."""
+        """Return the model by which this format is recognized, if a folder has one."""
         found = models_in(folder)
         return next((model.relative_to(folder).as_posix() for model in found), None)
 
     def capture(self) -> Capture:
-        """Return the registered photographs, in order of their names."""
+        """Return the registered photographs, sorted by name."""
         root = self.folder()
         folder = self._model(root)
         model = read_model(folder)
@@ -114,7 +114,7 @@ class ColmapReader(CaptureReader):
         return of_one_lens(capture, lenses)
 
     def _own(self, folder: str) -> bool:
-        """Return whether a folder is one of photographs, and not one that holds all kinds of pictures."""
+        """Return whether a folder contains only photographs, not all kinds of pictures."""
         return Path(folder) not in (self.folder(), self.top()) and Path(folder).is_relative_to(self.top())
 
     def _model(self, root: Path) -> Path:
@@ -151,12 +151,12 @@ def _view(image: ColmapImage, camera: ColmapCamera, path: Path) -> View:
 
 
 def _beside(model: Path, root: Path) -> tuple[str, ...]:
-    """Return the photographs' folder that belongs to a model's, before the usual ones."""
+    """Return the folder of photographs that belongs to a model's folder, to be tried before the usual ones."""
     return ("input",) if "distorted" in model.relative_to(root).parts else ()
 
 
 def _tracks(images: Sequence[ColmapImage], points: ColmapPoints) -> Int[ndarray, "seen 2"]:
-    """Return which point was seen in which photograph, by their rows; other photographs are left out."""
+    """Return which point was seen in which photograph, by row; unknown photographs are left out."""
     if not images:
         return np.zeros((0, 2), np.int64)
     numbers = np.array([image.number for image in images])
@@ -176,9 +176,9 @@ def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
 
 
 def models_in(root: Path) -> dict[Path, int]:
-    """Return the folders of a capture's models and how many photographs each has, if there are several to choose from.
+    """Return the folders of a capture's models and, if there are several, their numbers of photographs (else 0).
 
-    Those with most come first; of equal ones, the likeliest place.
+    The models with the most photographs come first; of equal ones, the likeliest folder.
     """
     models = list[Path]()
     for place in MODEL_FOLDERS:
@@ -192,7 +192,7 @@ def models_in(root: Path) -> dict[Path, int]:
 
 
 def _number_of_images(folder: Path) -> int:
-    """Return how many photographs a model has; 0 where its list is absent or damaged, which is said if it is read."""
+    """Return how many photographs a model has; 0 if its list is missing or damaged, which reading it reports."""
     try:
         with reading(folder):
             return max(
@@ -205,9 +205,9 @@ def _number_of_images(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model, each of its files in binary where there are two; refuse one that is not whole.
+    """Read a model, preferring binary files over text; refuse an incomplete one.
 
-    Sparse points that cannot be read are left out, which is said.
+    Unreadable sparse points are left out, which is logged.
     """
     cameras_path, images_path, points_path = (_file_of(folder, name) for name in FILES)
     if cameras_path.suffix == ".bin" and (folder / "cameras.txt").is_file():
@@ -226,7 +226,7 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def _file_of(folder: Path, name: str) -> Path:
-    """Return a file of a model, binary or text; where it is absent, it is missed beside others of its kind."""
+    """Return the path of a model's file, binary or text; a missing file has the same kind as the others."""
     endings = [ending for ending in KINDS if (folder / f"{name}{ending}").is_file()]
     endings += [ending for ending in KINDS if any((folder / f"{other}{ending}").is_file() for other in FILES)]
     ending = next(iter(endings), ".txt")
@@ -234,7 +234,7 @@ def _file_of(folder: Path, name: str) -> Path:
 
 
 def _points(path: Path, ply: Path) -> ColmapPoints:
-    """Return the sparse points of a model, or of the PLY file that 3DGS writes; none where they cannot be read."""
+    """Return the sparse points of a model, or of the PLY file that 3DGS writes; none if they cannot be read."""
     try:
         with reading(path, "They are not needed for training."):
             if os.path.lexists(path):

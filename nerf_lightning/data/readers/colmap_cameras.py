@@ -1,4 +1,4 @@
-"""COLMAP's camera models (colmap.github.io/cameras.html): their numbers and parameters, and the lens that each is."""
+"""COLMAP's camera models (colmap.github.io/cameras.html): their IDs, parameters and lenses."""
 
 import math
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from nerf_lightning.nerf.types.scene import LensModel
 
 @dataclass(frozen=True)
 class CameraModel:
-    """How to read a model's parameters; -1 stands for a parameter that it does not have."""
+    """Layout of a model's parameters; -1 marks a parameter that it does not have."""
 
     number: int
-    """In binary files."""
+    """Its ID in binary files."""
     num_params: int
     lens: LensModel | None = None
-    """None: none of ours."""
+    """None: not supported."""
     pinhole: tuple[int, ...] = ()
-    """Places of fx, fy, cx, cy."""
+    """Indices of fx, fy, cx, cy."""
     terms: tuple[int, int, int, int, int, int] = (-1, -1, -1, -1, -1, -1)
-    """Places of k1, k2, k3, k4, p1, p2."""
+    """Indices of k1, k2, k3, k4, p1, p2."""
     zeros: tuple[int, ...] = ()
-    """Places of rational, tangential and thin-prism terms that ours do not have: they must be 0."""
+    """Indices of unsupported rational, tangential and thin-prism terms: they must be 0."""
 
 
 ONE, TWO = (0, 0, 1, 2), (0, 1, 2, 3)
@@ -67,7 +67,7 @@ def intrinsics_of(
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float]]:
     """Return focal lengths and principal point in pixels, and k1, k2, k3, k4, p1, p2.
 
-    Of a panorama, the focal lengths are pixels per radian.
+    For a panorama, the focal lengths are in pixels per radian.
     """
     model = CAMERA_MODELS[camera.model]
     fx, fy, cx, cy = (camera.params[place] for place in model.pinhole)
@@ -78,12 +78,12 @@ def intrinsics_of(
 
 
 def lens_of(camera: ColmapCamera, folder: Path) -> LensModel:
-    """Return which lens of ours a camera has.
+    """Return a camera's lens model.
 
-    Refused is one that ours are not, or are only without some of its terms.
+    Refuse a camera that none of ours can express, or only without some of its terms.
 
     Raises:
-        InputError: with the models that are supported.
+        InputError: the model is not supported; the message lists those that are.
     """
     model = CAMERA_MODELS[camera.model]
     if model.lens is not None and not any(camera.params[place] for place in model.zeros):

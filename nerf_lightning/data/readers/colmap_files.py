@@ -1,7 +1,7 @@
 """The files of a COLMAP model (colmap.github.io/format.html), binary or text: cameras, photographs, sparse points.
 
-They are parsed here: COLMAP's own library hangs on some truncated ones. What a damaged file raises is for the caller
-to catch (`files.trust.reading`).
+They are parsed here: COLMAP's own library hangs on some truncated ones. The caller catches what damaged files raise
+(`files.trust.reading`).
 """
 
 import logging
@@ -29,7 +29,8 @@ WINDOWS = "cp1252"
 LONGEST_NAME = 1 << 14
 """In bytes."""
 MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
-"""Points, spread over all, whose tracks are read, up to `budgets.points` entries; photographs that a track may have."""
+"""Maximum number of evenly spread points whose tracks are read (up to `budgets.points` entries), and of photographs per
+track."""
 CURE = "Copy the model again, or run the reconstruction again (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 
@@ -44,7 +45,7 @@ class ColmapImage:
     name: str
     camera: int
     rotation: tuple[float, float, float, float]
-    """World to camera, a quaternion w, x, y, z."""
+    """World to camera, as a quaternion w, x, y, z."""
     translation: tuple[float, float, float]
 
 
@@ -54,19 +55,19 @@ class ColmapPoints:
 
     positions: Float[ndarray, "points 3"]
     errors: Float[ndarray, "points"]
-    """Mean reprojection error in pixels; -1 or NaN where it is not known."""
+    """Mean reprojection error in pixels; -1 or NaN if unknown."""
     tracks: Int[ndarray, "seen 2"]
-    """Row of a point, and number of a photograph that it was seen in."""
+    """Row of a point, and ID of a photograph in which it was seen."""
 
     @classmethod
     def of(cls, rows: Float[ndarray, "points 4"], images: ndarray, lengths: ndarray) -> "ColmapPoints":
-        """Return the points of rows (x, y, z, error), whose tracks follow each other."""
+        """Return the points of rows (x, y, z, error), whose tracks are concatenated."""
         point = np.repeat(np.arange(len(rows)), lengths)
         return cls(rows[:, :3].copy(), rows[:, 3].copy(), np.stack([point, images.astype(np.int64)], axis=1))
 
 
 class BinaryFiles:
-    """Parse cameras.bin, images.bin and points3D.bin: little-endian records, each list after its length."""
+    """Parse cameras.bin, images.bin and points3D.bin: little-endian records; each list is preceded by its length."""
 
     def cameras(self, path: Path) -> Iterator[ColmapCamera]:
         """Return the cameras."""
@@ -80,7 +81,7 @@ class BinaryFiles:
         data.end()
 
     def images(self, path: Path) -> Iterator[ColmapImage]:
-        """Return the photographs; the features in them are passed over."""
+        """Return the photographs; their features are skipped."""
         data = _Bytes(path)
         for _ in range(data.count(73, "views")):
             values = data.take("<I7dI")
@@ -90,7 +91,7 @@ class BinaryFiles:
         data.end()
 
     def number_of_images(self, path: Path) -> int:
-        """Return how many photographs a file announces."""
+        """Return the number of photographs that a file announces."""
         return _Bytes(path).count(73, "views")
 
     def points(self, path: Path) -> ColmapPoints:
@@ -113,13 +114,13 @@ class BinaryFiles:
 
 
 class _Bytes:
-    """A file's bytes, taken in order."""
+    """A file's bytes, read in order."""
 
     def __init__(self, path: Path):
         self.path, self.place = path, 0
         self.data: bytes | mmap.mmap
         with open_regular(path, "colmap", CURE) as file:
-            # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
+            # Mapped: most of the file is skipped (features, tracks) and need not be in memory.
             empty = os.fstat(file.fileno()).st_size == 0
             self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
@@ -129,7 +130,7 @@ class _Bytes:
         return values
 
     def count(self, least_bytes: int, budget: str) -> int:
-        """Return the length of a list whose entries take at least so many bytes."""
+        """Return the length of a list whose entries take at least `least_bytes` bytes."""
         count = int(self.take("<Q")[0])
         if count * least_bytes > len(self.data) - self.place:
             raise ValueError(f"it claims {count:,} entries, but has {len(self.data)} bytes")
@@ -137,7 +138,7 @@ class _Bytes:
         return count
 
     def numbers(self, kind: str, count: int) -> ndarray:
-        """Return numbers of one kind, in memory of their own."""
+        """Return a copy of `count` numbers of one kind."""
         numbers = np.frombuffer(self.data, kind, count, self.place).copy()
         self.skip(numbers.nbytes)
         return numbers
@@ -178,21 +179,21 @@ class TextFiles:
                 yield ColmapCamera(int(number), model, *sides, tuple(map(float, params)))
 
     def images(self, path: Path) -> Iterator[ColmapImage]:
-        """Return the photographs, each of which takes two lines; the second one, with its features, may be empty."""
+        """Return the photographs, each of which has two lines; the second one, with its features, may be empty."""
         lines = _lines(path, keep_empty=True)
-        # COLMAP, too, passes over empty lines before a photograph, but not where features are due.
+        # Like COLMAP, skip empty lines before a photograph, but not where features are due.
         for where, line in _within(((where, line) for where, line in lines if line), "views", path):
             with reading(where, CURE):
                 number, *numbers, camera, name = line.split(maxsplit=9)
                 qw, qx, qy, qz, x, y, z = map(float, numbers)
-                # Where the lines of features are missing, every second photograph would be taken for one.
+                # If the lines of features are missing, every second photograph would be mistaken for one.
                 features = next(lines, ("", ""))[1].split()
                 if len(features) % 3 or (features and int(features[-1]) < -1):
                     raise ValueError("the next line must hold features (x, y, number of the point), or be empty")
                 yield ColmapImage(int(number), name, int(camera), (qw, qx, qy, qz), (x, y, z))
 
     def number_of_images(self, path: Path) -> int:
-        """Return how many photographs a file holds."""
+        """Return the number of photographs in a file."""
         return sum(1 for _ in self.images(path))
 
     def points(self, path: Path) -> ColmapPoints:
@@ -212,7 +213,7 @@ class TextFiles:
 
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
-    """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
+    """Yield each line with its location, one at a time: a file of empty lines is small only on disk."""
     with open_regular(path, "colmap", CURE) as file:
         encoding = encoding_of(file)
         has_names = keep_empty and encoding == "utf-8-sig"
@@ -223,7 +224,7 @@ def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
 
 
 def _with_names(line: str, path: Path) -> str:
-    """Return a line that may have bytes which are no UTF-8: they are read as Windows writes names."""
+    """Return a line that may have bytes which are not UTF-8: they are decoded as Windows encodes names."""
     try:
         line.encode()
         return line
@@ -238,7 +239,7 @@ def _say_of_encoding(path: Path) -> None:
 
 
 def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterator[tuple[str, str]]:
-    """Return the lines, and refuse more than a budget allows: a text does not say how many there are."""
+    """Yield the lines, and refuse more than a budget allows: a text file does not announce its length."""
     most = getattr(limits(), budget)
     for number, line in enumerate(lines):
         if number == most:

@@ -1,7 +1,7 @@
-"""The frames of json files, in the flavours of Blender, nerfstudio and instant-ngp: pictures, poses and intrinsics.
+"""The frames of JSON files, in the flavors of Blender, nerfstudio and instant-ngp: pictures, poses and intrinsics.
 
-`settings` are a frame's keys over those at the file's top; a key that is null is one that is not there. What is read
-here is numbers; whether they make a camera is judged by `captures.checks`.
+`settings` are a frame's keys merged over the file's top-level keys; a key that is null counts as missing. This only
+reads numbers; `captures.checks` decides whether they are valid cameras.
 """
 
 import logging
@@ -47,11 +47,11 @@ LENSES: dict[str, LensModel] = {
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 UNREAD_LENSES = ("ftheta_p0", "latlong", "equirectangular")
-"""Keys of instant-ngp's lenses that are not read."""
+"""Keys of instant-ngp's unsupported lenses."""
 ANGLES = {"camera_angle_": (math.pi, "pi radians"), "_fov": (180.0, "180 degrees")}
-"""What a field of view is below, by its key."""
+"""Upper bound of a field of view, by its key."""
 TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
-"""Keys of instant-ngp, by which pixels of that level have no content."""
+"""Keys of instant-ngp that mark pixels of that level as transparent."""
 OF_PHOTOGRAPHS = ("fl_x", "fl_y", "k1", "k2", "p1", "p2", "camera_model", "aabb_scale")
 """Keys that renderings of the Blender format do not have."""
 FORMAT = "A transforms.json of nerfstudio or instant-ngp"
@@ -61,7 +61,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A json file with frames."""
+    """A JSON file with frames."""
 
     path: Path
     content: dict[str, Any]
@@ -69,7 +69,7 @@ class FrameFile:
 
     @classmethod
     def read(cls, path: Path, wanted_by: str = FORMAT) -> "FrameFile":
-        """Return the content of a file; `InputError` refuses one without a list of frames."""
+        """Return the content of a file; raise `InputError` for one without a list of frames."""
         content = read_json(path)
         (frames,) = keys_of(content, ("frames",), str(path), wanted_by)
         if not isinstance(frames, list):
@@ -84,9 +84,9 @@ class FrameFile:
 
     @property
     def is_photographed(self) -> bool:
-        """Return whether these are photographs, as instant-ngp's are, and not renderings of the Blender format.
+        """Return whether these are photographs, such as instant-ngp's, instead of renderings of the Blender format.
 
-        Photographs have a lens, or opaque pictures without one color at all four corners.
+        Photographs have a lens, or opaque pictures whose four corners are not all of one color.
         """
         first = self.frames[0] if self.frames and isinstance(self.frames[0], dict) else {}
         if any(key in {**self.content, **first} for key in OF_PHOTOGRAPHS):
@@ -104,7 +104,7 @@ class FrameFile:
 
 
 def say_of_files(files: Sequence[FrameFile]) -> None:
-    """Say what of the files of one capture is not used, or not modeled."""
+    """Log what in the files of one capture is not used or not modeled."""
     first, read = files[0].path, {file.path for file in files}
     beside = sorted(path.name for path in first.parent.glob("transform*_*.json") if path not in read)
     if beside:
@@ -125,24 +125,24 @@ def say_of_files(files: Sequence[FrameFile]) -> None:
 
 @dataclass(frozen=True)
 class FoundFrame:
-    """A frame whose picture is there."""
+    """A frame whose picture exists."""
 
     name: str
-    """Of the picture, as the file has it."""
+    """Of the picture, as in the file."""
     settings: dict[str, Any]
     view: View
     lens_model: LensModel
 
 
 def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, every: int = 1) -> list[FoundFrame]:
-    """Return the views of a file, and leave out those that cannot be used.
+    """Return the views of a file without those that cannot be used.
 
     Args:
-        file: what lists them.
+        file: lists them.
         root: the capture's folder.
-        outside: whether names may lead out of it.
-        left_out: takes the others.
-        every: take every k-th frame.
+        outside: whether names may point outside it.
+        left_out: collects the others.
+        every: take every `every`-th frame.
     """
     named: list[tuple[str, str, Any]] = []
     for index, frame in list(enumerate(file.frames))[::every]:
@@ -165,7 +165,7 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
     lens_model, lens = lens_of(settings, where)
     header = read_header(picture)
     stored_width, stored_height = map(float, header.size)
-    # The intrinsics may be those of another size.
+    # The intrinsics may be for another size.
     width, height = number_of(settings, "w", where, stored_width), number_of(settings, "h", where, stored_height)
     focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
     folder, dynamic = file.path.parent, picture.with_name(f"dynamic_mask_{picture.name}").with_suffix(".png")
@@ -189,7 +189,7 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
 
 
 def _radius(settings: dict[str, Any], stored_width: float, width: float, where: str) -> float | None:
-    """Return the circle of a fisheye that counts (nerfstudio), in pixels of the picture that is there."""
+    """Return the radius of a fisheye's valid circle (nerfstudio), in pixels of the actual picture."""
     if not settings.get("fisheye_crop_radius"):
         return None
     radius = positive_of(settings, "fisheye_crop_radius", where)
@@ -197,7 +197,7 @@ def _radius(settings: dict[str, Any], stored_width: float, width: float, where: 
 
 
 def path_of(name: object, key: str, where: str) -> str:
-    """Return a path as the file has it; refuse what is no text, or cannot be shown."""
+    """Return a path as in the file; refuse values that are not text or not printable."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: {key} is {name!r}, but it must be a path as text.")
     require_printable(name, where)
@@ -205,7 +205,7 @@ def path_of(name: object, key: str, where: str) -> str:
 
 
 def number_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return a number; refuse anything else, and one that is missing without a default."""
+    """Return a number; refuse anything else, and a missing one without a default."""
     value = settings.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {key} is {value!r}, but it must be a number. Export the file again.")
@@ -216,7 +216,7 @@ def number_of(settings: dict[str, Any], key: str, where: str, default: float | N
 
 
 def positive_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return a number above 0; `InputError` refuses another, and infinity."""
+    """Return a finite number above 0; raise `InputError` for any other."""
     value = number_of(settings, key, where, default)
     if not 0 < value < math.inf:
         raise InputError(f"{where}: {key} is {value:g}, but it must be above 0. Fix it, or remove it.")
@@ -224,7 +224,7 @@ def positive_of(settings: dict[str, Any], key: str, where: str, default: float |
 
 
 def length_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return a number that lengths are multiplied by; `InputError` refuses one that is no scale of a capture's."""
+    """Return a factor of lengths; raise `InputError` if it cannot be the scale of a capture."""
     value = positive_of(settings, key, where, default)
     if not LEAST_UNIT <= value <= LARGEST_UNIT:
         raise InputError(f"{where}: {key} is {value:g}, which is no scale. Fix it, or remove it.")
@@ -232,7 +232,7 @@ def length_of(settings: dict[str, Any], key: str, where: str, default: float | N
 
 
 def focal_of_angle(settings: dict[str, Any], key: str, length: float, where: str) -> float:
-    """Return the focal length in pixels of the field of view under a key: in radians, in degrees for `x_fov`."""
+    """Return the focal length in pixels for the field of view under a key: in radians, or degrees for `x_fov`."""
     angle, (half_turn, unit) = number_of(settings, key, where), ANGLES[key.strip("xy")]
     if not 0.0 < angle < half_turn:
         raise InputError(f"{where}: {key} is {angle}, but it must lie between 0 and {unit}.")
@@ -240,7 +240,7 @@ def focal_of_angle(settings: dict[str, Any], key: str, length: float, where: str
 
 
 def focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
-    """Return the focal lengths in pixels, of which one must be there; one that is missing is the other one."""
+    """Return the focal lengths in pixels, at least one of which is required; a missing one equals the other."""
     found = []
     for side, length in (("x", width), ("y", height)):
         if f"fl_{side}" in settings:
@@ -259,11 +259,11 @@ def focal_of(settings: dict[str, Any], width: float, height: float, where: str) 
 def panorama_focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
     """Return pixels per radian of an equirectangular panorama.
 
-    nerfstudio's fl_x and fl_y count pixels per half turn: half the width and the height of a whole panorama, which
-    they are taken for where they are missing.
+    nerfstudio's fl_x and fl_y count pixels per half turn: half the width and the height of a whole panorama, which are
+    also their defaults.
 
     Raises:
-        InputError: one is no number, or shows some directions twice.
+        InputError: one is not a number, or shows some directions twice.
     """
     x, y = number_of(settings, "fl_x", where, width / 2), number_of(settings, "fl_y", where, height)
     if not (x >= 0.495 * width and y >= 0.99 * height):

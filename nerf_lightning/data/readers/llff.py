@@ -1,4 +1,4 @@
-"""The LLFF format: `poses_bounds.npy` beside folders of photographs (images, or shrunk ones such as images_4)."""
+"""The LLFF format: `poses_bounds.npy` next to folders of photographs (images, or shrunk ones such as images_4)."""
 
 import logging
 import os
@@ -46,7 +46,7 @@ class LlffReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         return FILE if (folder / FILE).is_file() else None
 
     def capture(self) -> Capture:
@@ -90,7 +90,7 @@ class LlffReader(CaptureReader):
         return Capture(views=tuple(views), source=path, bounds=torch.from_numpy(rows[:, 15:]), left_out=left_out)
 
     def _sorted(self, names: list[str], path: Path) -> list[str]:
-        """Return the names in the order of the poses; say so where text and numbers differ."""
+        """Return the names in the order of the poses; log if the orders by text and by number differ."""
         require_one_of(("text", "numbers"), **{"scene.order": self.order})
         by_text, by_numbers = sorted(names), numeric_order(names)
         if by_text != by_numbers:
@@ -104,14 +104,14 @@ class LlffReader(CaptureReader):
 
 
 def _pictures_in(folder: Path) -> list[str]:
-    """Return the pictures in a folder itself."""
+    """Return the pictures directly in a folder."""
     if not os.path.isdir(folder):
         return []
     return [path.name for path in folder.iterdir() if path.name.lower().endswith(ENDINGS) and path.name[0] != "."]
 
 
 def _registered(root: Path, names: list[str]) -> list[str]:
-    """Return the photographs that view_imgs.txt says have poses (LLFF writes it), or none."""
+    """Return the photographs with poses according to LLFF's view_imgs.txt, or none."""
     path = root / "view_imgs.txt"
     if not path.is_file():
         return []

@@ -1,4 +1,4 @@
-"""The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a numpy archive."""
+"""The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a NumPy archive."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,10 +35,10 @@ class StoredImage(Photograph):
     image: Shaped[np.ndarray, "height width 3"] = field(compare=False, repr=False)
 
     def rgba(self) -> UInt8[np.ndarray, "height width 4"]:
-        """Return the pixels as 8-bit colors, round(255 x), opaque; `InputError` refuses values outside of 0..1."""
+        """Return the pixels as opaque 8-bit colors, round(255 x); raise `InputError` for values outside 0..1."""
         image = self.image
         if image.dtype != np.uint8:
-            # Written so that NaN fails too.
+            # Written so that NaN fails, too.
             if not ((image >= 0) & (image <= 1)).all():
                 raise InputError(
                     f"{self.path}: images[{self.number}] has values outside 0..1 or NaN. Divide 0..255 colors by 255, "
@@ -77,11 +77,11 @@ class NpzReader(CaptureReader):
         self.root = self.path or self.root
 
     def hold_out(self, views: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the views to learn from, and those to judge by."""
+        """Return the training views and the held-out views."""
         return super().hold_out(views) if self.hold_every else in_order(views, self.train_fraction)
 
     def protocol(self, judged_by: str) -> dict[str, str]:
-        """Return what measured numbers depend on: which views are judged."""
+        """Return what measured numbers depend on: which views are the test views."""
         rest = f"after the first {self.train_fraction:.0%}"
         return {"test_views": f"every {self.hold_every}th" if self.hold_every else rest}
 
@@ -90,7 +90,7 @@ class NpzReader(CaptureReader):
         return named_folder(self.root)
 
     def capture(self) -> Capture:
-        """Return the views, of a file that is downloaded first if it is absent and an address is given."""
+        """Return the views; download the file first if it is missing and a URL is given."""
         path = Path(self.root)
         if self.download and not path.exists():
             fetch(self.download["url"], path, self.download["bytes"], self.download["sha256"])

@@ -1,4 +1,4 @@
-"""Sparse points in a PLY file, as COLMAP, nerfstudio and splat trainers write them: positions alone are taken."""
+"""Sparse points in a PLY file, as COLMAP, nerfstudio and splat trainers write them: only positions are read."""
 
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ from nerf_lightning.messages.errors import InputError
 
 HEADER_BYTES = 1 << 16
 ROWS = 1 << 14
-"""Read together: splats have 248 bytes a point, of which 24 are kept."""
+"""Rows read at a time: splats have 248 bytes per point, of which 24 are kept."""
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -24,10 +24,10 @@ CURE = "Export the points again."
 
 
 def read_ply_points(path: Path) -> ColmapPoints:
-    """Return the vertices' positions; nothing is known of where they were seen.
+    """Return the vertices' positions; where they were seen is unknown.
 
     Raises:
-        InputError: no PLY file, one that is cut short, or more points than a person has agreed to.
+        InputError: the file is not a PLY file, is truncated, or has more points than the user allows.
     """
     with reading(path, CURE), open_regular(path, "ply", CURE) as file:
         head = file.read(HEADER_BYTES)
@@ -55,7 +55,7 @@ def read_ply_points(path: Path) -> ColmapPoints:
 
 
 def _header(text: str, path: Path) -> tuple[str, int, np.dtype]:
-    """Return the order of bytes, the number of vertices, and what a vertex holds; these come first in a file."""
+    """Return the byte order, the number of vertices, and a vertex's dtype; vertices come first in a file."""
     lines = [line.split() for line in text.splitlines()]
     order = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
     elements = [number for number, words in enumerate(lines) if words[:1] == ["element"]]

@@ -1,4 +1,4 @@
-"""`transforms.json` in the flavours of nerfstudio and instant-ngp: poses, intrinsics, lenses, masks, splits."""
+"""`transforms.json` in the flavors of nerfstudio and instant-ngp: poses, intrinsics, lenses, masks, splits."""
 
 import logging
 import os
@@ -41,14 +41,14 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class TransformsReader(CaptureReader):
-    """Read a transforms.json; intrinsics may stand at the top, for all views, or in a frame.
+    """Read a transforms.json; intrinsics may be at the top level, for all views, or in a frame.
 
     Args:
         file: the JSON file below root; paths in it are relative to its folder. null: transforms.json, or all
             transforms_*.json as one capture, whose splits are train, val and test.
         depth_unit: length of a unit of the depth maps (`depth_file_path`, `depth_path`), in the capture's units. null:
-            what the file says (`depth_unit_scale_factor`, `integer_depth_scale`), or else 0.001 of whole numbers and 1
-            of others.
+            from the file (`depth_unit_scale_factor`, `integer_depth_scale`), or else 0.001 for integers and 1 for
+            others.
     """
 
     named_by = (".json",)
@@ -59,7 +59,7 @@ class TransformsReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         return next((path.name for path in _files_in(folder)), None)
 
     def capture(self) -> Capture:
@@ -90,7 +90,7 @@ class TransformsReader(CaptureReader):
 
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()
-        if self.file is not None:  # it may lie in a folder that is a capture itself
+        if self.file is not None:  # it may be in a folder that is itself a capture
             places = [folder / self.file for folder in (named_folder(self.root), self.folder())]
             return [next(filter(os.path.isfile, places), places[0])]
         if os.path.isfile(root):
@@ -101,7 +101,7 @@ class TransformsReader(CaptureReader):
         return paths
 
     def _without_pose(self, views: list[View], left_out: LeftOut) -> tuple[str, ...]:
-        """Return the pictures that lie beside those that are named, where these lie in one folder of their own."""
+        """Return the unnamed pictures next to the named ones, if these have a folder of their own."""
         folders, root = {view.photograph.path.parent for view in views}, self.folder()
         folder = folders.pop() if len(folders) == 1 else root
         if folder == root or not folder.is_relative_to(root):
@@ -110,9 +110,9 @@ class TransformsReader(CaptureReader):
         return tuple(path.relative_to(root).as_posix() for path in pictures_below(folder) if path not in named)
 
     def _with_masks_and_depths(self, path: Path, found: list[FoundFrame], scale: float) -> list[View]:
-        """Return the views with the files that frames name beside their pictures.
+        """Return the views with the files that frames name in addition to their pictures.
 
-        Depths are those before applied_scale, which `scale` makes good for.
+        Depth maps are in units before applied_scale, for which `scale` compensates.
         """
         masks, depths, others = (
             self._files_of(path, found, key) for key in ("mask_path", "depth_file_path", "depth_path")
@@ -134,14 +134,14 @@ class TransformsReader(CaptureReader):
         return views
 
     def _depth_unit(self, frame: FoundFrame, path: Path) -> float | None:
-        """Return the length of a unit of a frame's depth map, as the user or the file says; None where neither does."""
+        """Return the length of a unit of a frame's depth map, from the user or the file; None if neither gives one."""
         if self.depth_unit is not None:
             return self.depth_unit
         key = next((key for key in DEPTH_UNITS if key in frame.settings), None)
         return None if key is None else length_of(frame.settings, key, str(path))
 
     def _files_of(self, path: Path, found: list[FoundFrame], key: str) -> list[Path | None]:
-        """Return the file that each frame names by a key; those that are not there are named, and their frames stay."""
+        """Return the file that each frame names under a key; missing files are logged, and their frames stay."""
         names = [str(each.settings[key]) if each.settings.get(key) else None for each in found]
         wanted = [name for name in names if name is not None]
         photographs = {each.view.photograph.path for each in found}
@@ -164,7 +164,7 @@ class TransformsReader(CaptureReader):
 
 
 def _arrays(names: list[str], folder: Path, root: Path, outside: bool) -> dict[str, Path]:
-    """Return the files of numpy's that depth maps may be."""
+    """Return the NumPy files that may be depth maps."""
     paths = {name: folder / name.replace("\\", "/") for name in names if name.lower().endswith(".npy")}
     return {
         name: path
@@ -174,7 +174,7 @@ def _arrays(names: list[str], folder: Path, root: Path, outside: bool) -> dict[s
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """Return transforms.json, or else all files that are one capture: of the splits, or of parts."""
+    """Return transforms.json, or else all files that form one capture: its splits or its parts."""
     for name in ("transforms.json", "transform.json"):
         if os.path.isfile(folder / name):
             return [folder / name]
@@ -208,7 +208,7 @@ def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, 
 
 
 def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[int, ...]] | None:
-    """Return the splits of files called after them; others are learned from."""
+    """Return the splits by the files' names; other files are for training."""
     splits: dict[str, tuple[int, ...]] = {split: () for split in SPLITS}
     start = 0
     for path, count in zip(paths, counts, strict=True):
@@ -219,7 +219,7 @@ def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[in
 
 
 def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ...]] | None:
-    """Return the splits that the file names, or that folders called train and test make."""
+    """Return the splits that the file names, or those of folders called train and test."""
     content, path = file.content, file.path
     lists = {split: content[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in content}
     if not lists:
@@ -229,7 +229,7 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
         }
         if not lists["train"] or not (lists["val"] or lists["test"]):
             return None
-    # As the frames write them, too: without an ending, say.
+    # As written in the frames, too: without an extension, say.
     numbers = {name: n for n, each in enumerate(found) for name in (each.view.name, _plain(each.name))}
     listed_at_all = {_plain(frame.get("file_path")) for frame in file.frames if isinstance(frame, dict)}
     splits: dict[str, tuple[int, ...]] = {}
@@ -257,9 +257,9 @@ def _plain(name: object) -> str:
 
 
 def _ngp_box(content: dict[str, Any], where: str) -> Float[Tensor, "2 3"] | None:
-    """Return the box of instant-ngp's `aabb_scale`: in its own units it is a cube of that size around 0.5.
+    """Return the box of instant-ngp's `aabb_scale`: in its own units, a cube of that size around 0.5.
 
-    Its positions are `scale` times the file's, plus `offset`; 0.33 and 0.5 where the file does not say.
+    Its positions are `scale` times the file's, plus `offset`; the defaults are 0.33 and 0.5.
     """
     if "aabb_scale" not in content:
         return None
@@ -274,7 +274,7 @@ def _ngp_box(content: dict[str, Any], where: str) -> Float[Tensor, "2 3"] | None
 
 
 def _undo_of(files: list[FrameFile]) -> Float[Tensor, "4 4"]:
-    """Return what takes the poses of all files to the frame that they come from, which must be one."""
+    """Return the transform of all files' poses into their original frame, which must be the same."""
     undo, *others = (_undo(file.content, str(file.path)) for file in files)
     for file, other in zip(files[1:], others, strict=True):
         if not torch.allclose(undo, other):
@@ -286,9 +286,9 @@ def _undo_of(files: list[FrameFile]) -> Float[Tensor, "4 4"]:
 
 
 def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:
-    """Invert nerfstudio's `applied_transform` and `applied_scale`: results line up with what the poses came from.
+    """Invert nerfstudio's `applied_transform` and `applied_scale`: results align with the poses' source.
 
-    In the file's poses the transform was applied to the camera, and then the scale to its center.
+    In the file's poses, the transform was applied to the camera, and then the scale to its center.
     """
     applied = torch.eye(4, dtype=torch.float64)
     if "applied_transform" in content:

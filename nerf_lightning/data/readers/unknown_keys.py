@@ -1,4 +1,4 @@
-"""Every key of a json file of frames: what is used, what is not modeled, and what says nothing about the pictures."""
+"""Keys of a JSON file of frames: those that are used, not modeled, or irrelevant to the pictures."""
 
 import logging
 from collections.abc import Iterable, Mapping
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 def say_of_keys(where: Path, dictionaries: Iterable[Mapping[str, Any]]) -> None:
-    """Say once which keys of a file and its frames are not modeled, and which are not known.
+    """Log once which keys of a file and its frames are not modeled, and which are unknown.
 
     Args:
         where: the file, for messages.
@@ -59,5 +59,5 @@ def say_of_keys(where: Path, dictionaries: Iterable[Mapping[str, Any]]) -> None:
 
 
 def _says(value: object) -> bool:
-    """Return whether a value says anything: zero, false, and lists of nothing else do not."""
+    """Return whether a value has an effect: zero, false, and lists of nothing else have none."""
     return any(value) if isinstance(value, list) else bool(value)

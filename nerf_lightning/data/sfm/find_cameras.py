@@ -1,4 +1,4 @@
-"""Attempts at finding cameras, one after the other as long as photographs are left out."""
+"""Find cameras in successive attempts, as long as photographs are left out."""
 
 import logging
 from pathlib import Path
@@ -20,7 +20,7 @@ from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StageProgress
 
 WORSE = 1.5
-"""How many times as large the reprojection error may become for the sake of another photograph."""
+"""Factor by which the reprojection error may grow if more photographs are placed."""
 
 log = logging.getLogger(__name__)
 
@@ -30,18 +30,18 @@ def find_cameras(
 ) -> SparseModel:
     """Find the cameras of photographs and write the largest model in COLMAP's binary form.
 
-    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in meters with
-    z up where GPS tells (`align_to_gps`). Of several attempts, the one that places most photographs counts.
+    Poses are COLMAP's: world to camera, axes right, down, forward, in a frame and scale of its own, or in meters with z
+    up if GPS is available (`align_to_gps`). Of several attempts, the one that places most photographs counts.
 
     Args:
         photographs: in the order in which they were taken.
-        folder: where the pixels lie, upright, under the photographs' names.
-        work: a folder for databases and lists; what is left there can go.
-        sparse: the folder for cameras.bin, images.bin, points3D.bin; made here.
-        settings: how.
+        folder: contains the upright pictures under the photographs' names.
+        work: a folder for databases and lists; its contents can be deleted afterward.
+        sparse: the folder for cameras.bin, images.bin, points3D.bin; created here.
+        settings: of structure from motion.
 
     Raises:
-        InputError: no pycolmap, or photographs of several sizes for one camera.
+        InputError: pycolmap is missing, or one camera has photographs of several sizes.
         NothingFoundError: nothing can be reconstructed.
     """
     best: list[Any] = []

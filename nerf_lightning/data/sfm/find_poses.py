@@ -1,4 +1,4 @@
-"""Structure from motion from beginning to end: photographs or a video in, a capture in a folder out, or nothing."""
+"""Structure from motion from end to end: turn photographs or a video into a capture in a folder, or nothing."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,13 +21,13 @@ from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 
 READING, FRAMES = "reading photographs", "choosing frames"
 READING_COST, FRAME_COST = 0.1, 0.02
-# So many are looked at to say why a video failed.
+# Number of frames that are examined to explain why a video failed.
 FRAMES_JUDGED = 20
 UNFINISHED = ".poses.part"
 
 
 def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
-    """Refuse to write over poses, or over pictures that are not those of `source`, through links either."""
+    """Refuse to overwrite poses, or pictures that are not those of `source`, even through links."""
     if child_of(folder, "sparse", "0").exists():
         raise InputError(
             f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
@@ -43,11 +43,11 @@ def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
 
 @contextmanager
 def _unfinished(folder: Path) -> Iterator[Path]:
-    """Lend a folder in `folder` that vanishes at the end, and `folder` with it if nothing came to lie in it."""
+    """Yield a temporary folder in `folder`; delete it at the end, and `folder` with it if that is empty."""
     scratch, is_new = ScratchFolder(folder, UNFINISHED, "finds poses"), not folder.exists()
     scratch.hold()
     try:
-        empty_ours(scratch.path)  # of what a killed process left
+        empty_ours(scratch.path)  # of files that a killed process left
         with full_disk_named(folder):
             yield scratch.path
     finally:
@@ -57,12 +57,12 @@ def _unfinished(folder: Path) -> Iterator[Path]:
 
 
 def from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple[SparseModel, str]:
-    """Find the cameras of photographs, and write a capture; return what was found, and how photographs were paired.
+    """Find the cameras of photographs, and write a capture; return the model, and how photographs were paired.
 
-    The folder to write may be the one that holds the photographs, in `images`.
+    The output folder may be the one that contains the photographs in `images`.
 
     Raises:
-        InputError: photographs that cannot be used, or whose cameras cannot be found.
+        InputError: photographs are unusable, or their cameras cannot be found.
     """
     photographs = of_one_kind(find_photographs(source), settings.panoramas, f"images={source}")
     in_place = (folder / "images").exists()
@@ -87,10 +87,10 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple
 
 
 def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettings) -> tuple[SparseModel, str]:
-    """Choose sharp frames of a video, one of `every` (None: some hundred), find their cameras, and write a capture.
+    """Choose sharp frames of a video, one in `every` (None: about a hundred), find their cameras, and write a capture.
 
     Raises:
-        InputError: no video, or one whose cameras cannot be found.
+        InputError: the file is not a video, or its cameras cannot be found.
     """
     num_frames = count_frames(video)
     stride = frame_stride(num_frames, every)
@@ -129,7 +129,7 @@ def _nothing_in_video(video: Path, frames: list[FoundPhotograph], cause: str) ->
 
 
 def _publish(work: Path, folder: Path) -> None:
-    """Move what is finished to its place; sparse/0 comes last, for it says that all is there."""
+    """Move finished files to their destination; sparse/0 comes last, because it marks completion."""
     if (work / "images").exists():
         (work / "images").rename(folder / "images")
     (work / "sparse" / "0").rename(make_folder(folder, "sparse") / "0")

@@ -1,4 +1,4 @@
-"""Scale, up and north from the places that cameras and drones write into their photographs (EXIF)."""
+"""Scale, up and north from the GPS positions that cameras and drones write into photographs (EXIF)."""
 
 import logging
 import math
@@ -15,18 +15,18 @@ from nerf_lightning.data.pixels.picture_files import DECODER_ERRORS, opened_pict
 from nerf_lightning.messages.errors import InputError
 
 EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Radius of the earth in meters, and by how much it is less at the poles (WGS 84)."""
+"""Equatorial radius of the earth in meters, and its flattening at the poles (WGS 84)."""
 FEWEST = 4
 OFF = 10.0
-"""Meters by which a receiver may be wrong."""
+"""Error of a receiver in meters."""
 LEAST_SPREAD = 4.0
-"""How much farther the places must lie apart, across their longest line, than they are off."""
+"""Minimum ratio of the positions' spread across their longest line to their error."""
 
 log = logging.getLogger(__name__)
 
 
 def gps_of(path: Path) -> tuple[float, float, float] | None:
-    """Return latitude and longitude in degrees, and meters above the sea; None where a photograph does not say."""
+    """Return latitude and longitude in degrees, and altitude in meters; None if a photograph has none."""
     try:
         with opened_picture(path) as image:
             said: Mapping[int, Any] = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
@@ -45,7 +45,7 @@ def _degrees(said: Mapping[int, Any], key: int, negative: str) -> float:
 
 
 def in_metres(places: Sequence[tuple[float, float, float]]) -> Float[ndarray, "photographs 3"]:
-    """Return places as meters east, north and up from their middle, on the plane that touches the earth there.
+    """Return positions as meters east, north and up from their center, in the tangent plane there.
 
     >>> in_metres([(0.0, 0.0, 5.0), (0.0, 0.001, 5.0)]).round(1).tolist()
     [[-55.7, 0.0, 0.0], [55.7, 0.0, 0.0]]
@@ -61,14 +61,14 @@ def in_metres(places: Sequence[tuple[float, float, float]]) -> Float[ndarray, "p
 
 
 def align_to_gps(colmap: Any, model: Any, folder: Path) -> bool:
-    """Bring a COLMAP model into meters, x to the east and z up, where its photographs say well enough where they were.
+    """Align a COLMAP model to meters, x east and z up, if the GPS positions of its photographs are good enough.
 
-    The places must fit the model, and lie apart in two directions by several times what they are off: a table that
-    was photographed from all sides is smaller than a receiver's error.
+    The positions must fit the model, and spread in two directions by several times their error: a table that was
+    photographed from all sides is smaller than a receiver's error.
 
     Args:
         colmap: the module pycolmap.
-        model: its reconstruction; changed where this returns true.
+        model: its reconstruction; modified if this returns true.
         folder: of the photographs.
     """
     names = [model.image(number).name for number in model.reg_image_ids()]

@@ -1,4 +1,4 @@
-"""Films in HDR, as phones take them: recognized, and the frames that are kept tone-mapped to SDR by ffmpeg."""
+"""Recognize HDR films, as phones record them, and tone-map the kept frames to SDR by ffmpeg."""
 
 import logging
 import re
@@ -11,23 +11,23 @@ import numpy as np
 from jaxtyping import UInt8
 
 HDR = re.compile(r"\b(arib-std-b67|smpte2084)\b")
-"""How ffmpeg calls the transfer functions HLG (also that of phones' Dolby Vision, profile 8.4) and PQ (HDR10)."""
+"""ffmpeg's names of the transfer functions HLG (also of phones' Dolby Vision, profile 8.4) and PQ (HDR10)."""
 FILTERS = {"zscale", "tonemap"}
 TO_SDR = (
     "format=gbrp,setparams=color_primaries=bt2020:color_trc={transfer}:colorspace=gbr:range=pc,format=gbrpf32le,"
     "zscale=transfer=linear:npl=203,zscale=primaries=bt709,tonemap=mobius:param=0.7:desat=0,zscale=transfer=bt709"
 )
-"""White is where BT.2408 puts it, at 203 nits; up to 0.7 of it colors are kept, above they are compressed."""
+"""White is at 203 nits, as in BT.2408; up to 0.7 of it colors are kept, above they are compressed."""
 
 log = logging.getLogger(__name__)
 
 
 def hdr_transfer(video: Path, input_params: Sequence[str]) -> str | None:
-    """Return ffmpeg's name of the transfer function of a film in HDR that can be tone-mapped; else None.
+    """Return ffmpeg's name of an HDR film's transfer function if it can be tone-mapped; else None.
 
     Args:
         video: the film.
-        input_params: what ffmpeg is told before its name.
+        input_params: ffmpeg's arguments before its name.
 
     Raises:
         OSError, RuntimeError, ValueError, IndexError: ffmpeg cannot read it.
@@ -50,7 +50,7 @@ def hdr_transfer(video: Path, input_params: Sequence[str]) -> str | None:
 
 
 def tone_mapped(frame: UInt8[np.ndarray, "height width 3"], transfer: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a frame of a film in HDR, whose primaries are those of BT.2020, as SDR (BT.709).
+    """Return a frame of an HDR film with BT.2020 primaries as SDR (BT.709).
 
     Raises:
         RuntimeError: ffmpeg fails.

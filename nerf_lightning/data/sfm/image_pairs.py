@@ -1,4 +1,4 @@
-"""Which photographs are compared with each other."""
+"""Choose which photographs are compared with each other."""
 
 from itertools import combinations, groupby
 from typing import Literal
@@ -11,7 +11,7 @@ TILE = 12
 
 
 def chosen_matching(matching: Matching, count: int) -> Matching:
-    """Return how `count` photographs are compared: `auto` means all pairs while these are few (3160 for 80)."""
+    """Return how `count` photographs are compared: `auto` means all pairs if these are few (3160 for 80)."""
     if matching != "auto":
         return matching
     return "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
@@ -20,8 +20,8 @@ def chosen_matching(matching: Matching, count: int) -> Matching:
 def image_pairs(matching: Matching, count: int) -> list[tuple[int, int]]:
     """Return pairs (i, j), i < j, of photographs 0 to count - 1 in the order in which they were taken.
 
-    Sequential: the ten that follow, those at a distance of a power of two, and all pairs among some forty spread over
-    the whole, so that a path that comes back to where it was is closed. The number grows with count log count.
+    Sequential: the next ten, those at a distance of a power of two, and all pairs among some forty spread over the
+    whole, to close loops of the path. The number grows with count log count.
 
     >>> image_pairs("exhaustive", 3)
     [(0, 1), (0, 2), (1, 2)]
@@ -37,7 +37,7 @@ def image_pairs(matching: Matching, count: int) -> list[tuple[int, int]]:
 
 
 def tiles_of(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Return the pairs in groups among few photographs: comparing a group loads and indexes each of these once."""
+    """Group the pairs by few photographs each: comparing a group loads and indexes each photograph once."""
 
     def tile(pair: tuple[int, int]) -> tuple[int, int]:
         return pair[0] // TILE, pair[1] // TILE

@@ -1,7 +1,7 @@
-"""Panoramas of all directions: which photographs are some, and which of a mix are taken.
+"""Recognize full panoramas among photographs, and choose one kind from a mix.
 
-Cameras of panoramas are found on the panoramas themselves, by COLMAP's EQUIRECTANGULAR camera: it has no lens to find,
-and compares rays, so that features count in all directions.
+Cameras of panoramas are found on the panoramas themselves with COLMAP's EQUIRECTANGULAR camera: it has no lens to
+estimate, and compares rays, so that features count in all directions.
 """
 
 import logging
@@ -15,29 +15,30 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
-"""COLMAP's name of their camera, and that of transforms.json."""
+"""Their camera model in COLMAP and in transforms.json."""
 STRETCH = 0.01
-"""By which a panorama's width may differ from twice its height: some cameras cut a few rows off."""
+"""Relative tolerance of a panorama's width against twice its height: some cameras crop a few rows."""
 STATIONARY = 1 / 720
-"""Of a panorama's width, half a degree: details that move less between two panoramas are carried along."""
+"""Share of a panorama's width (half a degree): details that move less between two panoramas move with the camera."""
 
 log = logging.getLogger(__name__)
 
 
 def of_one_kind(photographs: Sequence[FoundPhotograph], panoramas: Panoramas, source: str) -> list[FoundPhotograph]:
-    """Return the photographs whose cameras can be found together: panoramas alone, or others alone.
+    """Return the photographs whose cameras can be found together: only panoramas, or only others.
 
-    With `auto`, panoramas are those that say so and those of the same size; where none says so, all are, if every one
+    With `auto`, panoramas are those marked as such and those of the same size; if none is marked, all are, if every one
     is exactly twice as wide as high. Of a mix, the panoramas are left out if at least three others remain, else the
-    others. What is left out is named in a warning.
+    others. A warning names what is left out.
 
     Args:
-        photographs: with `is_panorama` as their headers say.
-        panoramas: true takes what is twice as wide as high, within 1 %; false takes all as plain photographs.
-        source: what a person has given, for messages: `images=DIR` or `video=FILE`.
+        photographs: with `is_panorama` from their headers.
+        panoramas: true treats pictures twice as wide as high, within 1 %, as panoramas; false treats all as plain
+            photographs.
+        source: as given by the user, for messages: `images=DIR` or `video=FILE`.
 
     Returns:
-        The photographs that are taken, in the same order, all with the same `is_panorama`.
+        The chosen photographs, in the same order, all with the same `is_panorama`.
 
     Raises:
         InputError: fewer than three of either kind.
@@ -52,7 +53,7 @@ def of_one_kind(photographs: Sequence[FoundPhotograph], panoramas: Panoramas, so
             f"(within 1 %), as panoramas of all directions are, and at least {FEWEST} are needed. Export the panoramas "
             "as equirectangular pictures from the camera's program, or leave panoramas=auto."
         )
-    # Those of a part of the directions say that they are panoramas, too, and no camera of COLMAP's is like theirs.
+    # Partial panoramas are marked as panoramas, too, and COLMAP has no camera model for them.
     unlike = {*around, *said}
     plain = [photograph for photograph in photographs if photograph not in unlike]
     takes_panoramas = panoramas is True or len(plain) < FEWEST
@@ -75,15 +76,15 @@ def of_one_kind(photographs: Sequence[FoundPhotograph], panoramas: Panoramas, so
 
 
 def lens_of(colmap: Any, photographs: Sequence[FoundPhotograph], otherwise: str) -> str:
-    """Return COLMAP's name of the lens model of photographs of one kind.
+    """Return COLMAP's lens model for photographs of one kind.
 
     Args:
         colmap: the module pycolmap.
-        photographs: as `of_one_kind` returns them.
-        otherwise: the model of those that are no panoramas.
+        photographs: as returned by `of_one_kind`.
+        otherwise: the model for other photographs.
 
     Raises:
-        InputError: panoramas, and a pycolmap that does not know them.
+        InputError: this pycolmap does not support panoramas.
     """
     if not any(photograph.is_panorama for photograph in photographs):
         return otherwise
@@ -98,8 +99,8 @@ def lens_of(colmap: Any, photographs: Sequence[FoundPhotograph], otherwise: str)
 def verification_of(colmap: Any, photographs: Sequence[FoundPhotograph]) -> Any:
     """Return pycolmap's options for verifying the pairs of photographs of one kind.
 
-    Every panorama shows who carries the camera, or its tripod, at the same place in the picture. These details match
-    best of all and say that the camera stood still, so details that stay where they are do not count.
+    Every panorama shows the person who carries the camera, or its tripod, at the same place in the picture. These
+    details match best and suggest that the camera did not move, so stationary details do not count.
     """
     options = colmap.TwoViewGeometryOptions()
     if any(photograph.is_panorama for photograph in photographs):
@@ -109,7 +110,7 @@ def verification_of(colmap: Any, photographs: Sequence[FoundPhotograph]) -> Any:
 
 
 def _all_around(photographs: Sequence[FoundPhotograph], panoramas: Panoramas, source: str) -> list[FoundPhotograph]:
-    """Return the panoramas of all directions, as `of_one_kind` tells them."""
+    """Return the full panoramas, by the rules of `of_one_kind`."""
     whole = [p for p in photographs if abs(p.width / (2 * p.height) - 1.0) <= STRETCH]
     sizes = {(p.width, p.height) for p in photographs if p.is_panorama}
     if panoramas is True:

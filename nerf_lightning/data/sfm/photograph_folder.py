@@ -1,4 +1,4 @@
-"""Photographs as they come from a camera: found, checked, and put upright beside the poses that will be found."""
+"""Find and check photographs as they come from a camera, and put them upright next to the poses to be found."""
 
 import logging
 import os
@@ -24,9 +24,9 @@ from nerf_lightning.messages.escaping import is_plain, listed
 
 READ_BY_COLMAP = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 WRITTEN_ANEW = (".webp", ".avif")
-"""And HEIC, where it is read."""
+"""HEIC, too, if it is supported."""
 PANORAMA = b"equirectangular"
-"""In XMP (Google's GPano:ProjectionType), which panorama cameras write."""
+"""The marker in XMP (Google's GPano:ProjectionType) that panorama cameras write."""
 FEWEST = 3
 SMALLEST_SIDE = 64
 JPEG_QUALITY = 95
@@ -38,46 +38,46 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FoundPhotograph:
-    """A picture file and what its header says; sizes in pixels, upright."""
+    """A picture file and its header; sizes in pixels, upright."""
 
     path: Path
     width: int
     height: int
     upright: bool
-    """Whether the pixels are stored as they are shown, not turned by an EXIF tag."""
+    """Whether the pixels are stored upright, not rotated by an EXIF tag."""
     is_panorama: bool
-    """Whether it shows all directions: as its header says, or as `of_one_kind` has decided."""
+    """Whether it shows all directions, according to its header or `of_one_kind`."""
     lens: tuple[str, ...]
-    """What EXIF says of camera, focal length and zoom; empty words where it says nothing."""
+    """Camera, focal length and zoom from EXIF; empty strings if unknown."""
     has_alpha: bool = False
 
     @property
     def name(self) -> str:
-        """Return what it is called beside the poses: with another ending where COLMAP does not read its format."""
+        """Return its name next to the poses: with another extension if COLMAP does not read its format."""
         if self.path.suffix.lower() in READ_BY_COLMAP:
             return self.path.name
         return f"{self.path.name}.{'png' if self.has_alpha else 'jpg'}"
 
     @property
     def as_it_is(self) -> bool:
-        """Return whether COLMAP reads the file itself, upright."""
+        """Return whether COLMAP reads the unmodified file upright."""
         return self.upright and self.name == self.path.name
 
     @property
     def camera(self) -> tuple[int, int, tuple[str, ...]]:
-        """Return what photographs of one camera and zoom share; panoramas of one size differ in nothing."""
+        """Return the key that photographs of one camera and zoom share; panoramas of one size all share it."""
         return self.width, self.height, () if self.is_panorama else self.lens
 
 
 def find_photographs(folder: Path) -> list[FoundPhotograph]:
-    """Return the photographs that lie in a folder, sorted by name; folders inside it are not searched.
+    """Return the photographs directly in a folder, sorted by name.
 
     Args:
-        folder: where they lie; it, and they, may be links.
+        folder: contains them; it, and they, may be links.
 
     Raises:
-        InputError: no such folder, fewer than three pictures in it, more than a person has agreed to, or one
-            that cannot be read or is tiny.
+        InputError: the folder does not exist, contains fewer than three pictures or more than the user allows, or one
+            that is unreadable or tiny.
     """
     try:
         files, pictures = files_in(folder)
@@ -94,7 +94,7 @@ def find_photographs(folder: Path) -> list[FoundPhotograph]:
             *(len(odd), len(pictures), listed(odd, 5)),
         )
         pictures = [path for path in pictures if is_plain(path.name)]
-    # What lies beside a JPEG of its name is the original of it.
+    # A file next to a JPEG of the same name is its original.
     known = {path.stem.lower() for path in pictures}
     others = [path for path in files if path.stem.lower() not in known]
     heic = [path.name for path in others if path.suffix.lower() in HEIC_ENDINGS]
@@ -116,9 +116,9 @@ def find_photographs(folder: Path) -> list[FoundPhotograph]:
 
 
 def files_in(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files that lie in a folder, sorted by name, and those that are photographs by their names.
+    """Return the files in a folder, sorted by name, and those that are photographs by their names.
 
-    A HEIC, AVIF or WebP beside a JPEG, PNG or TIFF of the same name is the original of it, and no other photograph.
+    A HEIC, AVIF or WebP next to a JPEG, PNG or TIFF of the same name is its original, not another photograph.
     """
     files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
     plain = {path.stem.lower() for path in files if path.suffix.lower() in READ_BY_COLMAP}
@@ -132,9 +132,9 @@ def files_in(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
-    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew.
+    """Put a photograph into a folder as a hard link, or a copy if that is impossible; re-encode a rotated one.
 
-    So is one of a format that COLMAP does not read.
+    Also re-encode one in a format that COLMAP does not read.
     """
     target = folder / photograph.name
     if not photograph.as_it_is:
@@ -147,7 +147,7 @@ def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
 
 
 def check_pixels(photograph: FoundPhotograph) -> None:
-    """Decode a photograph once, so that a damaged one is named before hours are spent on the others."""
+    """Decode a photograph once, so that a damaged one is reported before hours are spent on the others."""
     if photograph.as_it_is:
         read_rgba(photograph.path)
 
@@ -166,15 +166,15 @@ def _photograph(path: Path) -> FoundPhotograph:
 
 
 def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...], bool]:
-    """Return how a photograph is turned, whether it is a panorama, what tells its lens apart, and if it has alpha."""
+    """Return a photograph's orientation, whether it is a panorama, what identifies its lens, and if it has alpha."""
     with opened_picture(path) as image:
         try:
-            # Pillow would decode a whole PNG to look for EXIF behind its pixels.
+            # Pillow would decode a whole PNG to find EXIF behind its pixels.
             exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
-            # Of a TIFF, this reads the file.
+            # For a TIFF, this reads the file.
             details = exif.get_ifd(ExifTags.IFD.Exif)
         except DECODER_ERRORS:
-            exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
+            exif, details = Image.Exif(), {}  # damage is reported when the pixels are decoded
         xmp = image.info.get("xmp", b"")
         is_panorama = PANORAMA in (xmp if isinstance(xmp, bytes) else str(xmp).encode())
         has_alpha = image.has_transparency_data
@@ -191,7 +191,7 @@ def _write_anew(path: Path, target: Path) -> None:
         raise InputError(
             f"{path} cannot be converted: {error}. It may be damaged or cut short; copy it from the camera again."
         ) from error
-    # PNG and TIFF take no notice of the quality.
+    # PNG and TIFF ignore the quality.
     upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
 
 

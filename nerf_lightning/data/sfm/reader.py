@@ -1,4 +1,4 @@
-"""Photographs, or a video, and nothing else: their cameras are found, kept, and taken again the next time."""
+"""Read photographs or a video without cameras: the cameras are found, cached, and reused."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class PhotosReader(AutoReader):
-    """Read photographs whose cameras nobody knows yet; a folder of a known format is read as what it is.
+    """Read photographs with unknown cameras; a folder of a known format is read in that format.
 
     Args:
         root: the folder of the photographs, or the parent of a folder `images`.
@@ -40,10 +40,10 @@ class PhotosReader(AutoReader):
     panoramas: Panoramas = "auto"
 
     def reader(self) -> CaptureReader:
-        """Find the cameras, unless they are known, and return the reader of what was found.
+        """Find the cameras, unless they are known, and return the reader of the result.
 
         Raises:
-            InputError: no photographs, or cameras that cannot be found.
+            InputError: there are no photographs, or their cameras cannot be found.
         """
         if (self.root is None) == (self.video is None):
             raise InputError(
@@ -57,7 +57,7 @@ class PhotosReader(AutoReader):
         return ColmapReader(**self._chosen() | {"root": str(found), "name": self.name, "downscale": self.downscale})
 
     def _cameras(self) -> Path:
-        """Return the folder of a capture, which is made where it is not there yet."""
+        """Return the folder of the capture, which is made if it does not exist."""
         source, settings = self._source(), SfmSettings(panoramas=self.panoramas)
         cache = default_folder("poses") if self.cache_dir is None else Path(self.cache_dir).expanduser() / "poses"
         folder = cache / _key(source, settings)
@@ -85,7 +85,7 @@ class PhotosReader(AutoReader):
 
 
 def _key(source: Path, settings: SfmSettings) -> str:
-    """Return what found cameras are kept under: the photographs' names, sizes and times of change, and the settings."""
+    """Return the cache key of found cameras: the photographs' names, sizes and modification times, and the settings."""
     try:
         files = files_in(source)[1] if source.is_dir() else [source]
     except OSError as error:

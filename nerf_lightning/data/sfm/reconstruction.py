@@ -1,7 +1,7 @@
 """Structure from motion on the CPU with pycolmap: photographs to cameras, poses and points.
 
-The method is COLMAP's (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT features, pairs
-matched and verified, photographs registered one after the other, bundle adjustment.
+The method is COLMAP's (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT features, matching
+and verification of pairs, incremental registration of photographs, bundle adjustment.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ Report = Callable[[str, float], None]
 
 
 class NothingFoundError(InputError):
-    """Photographs none of whose cameras could be placed; `cause` completes "the pictures ..."."""
+    """No camera of the photographs could be placed; `cause` completes "the pictures ..."."""
 
     def __init__(self, message: str, cause: str):
         super().__init__(message)
@@ -32,32 +32,32 @@ class NothingFoundError(InputError):
 
 
 OF_ONE_PHOTOGRAPH = "SIMPLE_RADIAL"
-# A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
+# A model of fewer than three photographs is useless; COLMAP would discard those of fewer than ten.
 FEWEST_REGISTERED = 3
 FEWEST_POINTS = 30
-"""That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
+"""Minimum number per photograph: with fewer, GLOMAP places it anywhere. COLMAP's own mapper requires as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
 WITHOUT_DEPTH = "show the same details without depth, all from one position or of one flat surface"
-"""Why nothing was found, where more than half of the compared pairs say so."""
+"""Why nothing was found, if it applies to more than half of the compared pairs."""
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """What was found, in short."""
+    """A summary of the result."""
 
     registered: tuple[str, ...]
     left_out: tuple[str, ...]
     apart: tuple[str, ...]
-    """Of those left out: registered with each other, and not with the rest, as photographs of another place are."""
+    """Left-out photographs that were registered only with each other, such as those of another place."""
     num_points: int
     num_cameras: int
     reprojection_error: float
-    """Mean over the points of their mean distance from where they were seen, in pixels."""
+    """Mean reprojection error of the points in pixels."""
 
 
 def require_pycolmap() -> Any:
-    """Return pycolmap, or say how it is installed."""
+    """Return pycolmap, or report how to install it."""
     return require_extra("pycolmap", "colmap", "Finding camera poses")
 
 
@@ -69,18 +69,18 @@ def reconstruct(
     attempt: Attempt,
     report: Report = lambda stage, fraction: None,
 ) -> list[Any]:
-    """Return COLMAP's models of photographs, the largest first: photographs of several places make several.
+    """Return COLMAP's models of photographs, the largest first: photographs of several places yield several.
 
     Args:
         photographs: of one kind, in the order in which they were taken.
-        folder: where the pixels lie, upright, under the photographs' names.
-        work: a folder for databases and lists; features that an attempt has left there are taken again.
-        settings: how.
-        attempt: with which features and which mapper.
-        report: called with a stage of `stage_costs` and how much of it is done, 0 to 1.
+        folder: contains the upright pictures under the photographs' names.
+        work: a folder for databases and lists; features that an earlier attempt left there are reused.
+        settings: of structure from motion.
+        attempt: the features and the mapper.
+        report: called with a stage of `stage_costs` and its progress from 0 to 1.
 
     Raises:
-        InputError: no pycolmap, or one without panoramas, or photographs of several sizes for one camera.
+        InputError: pycolmap is missing or does not support panoramas, or one camera has photographs of several sizes.
     """
     colmap = require_pycolmap()
     lens = lens_of(colmap, photographs, settings.camera_model)
@@ -98,7 +98,7 @@ def reconstruct(
 
 
 def in_short(models: list[Any], names: list[str]) -> SparseModel:
-    """Return what was found of photographs, in short."""
+    """Return a summary of the models."""
     model = models[0]
     registered, *others = ({each.image(number).name for number in each.reg_image_ids()} for each in models)
     return SparseModel(
@@ -112,7 +112,7 @@ def in_short(models: list[Any], names: list[str]) -> SparseModel:
 
 
 def cause_of_nothing(work: Path, attempt: Attempt) -> str:
-    """Return why an attempt has placed no camera: "the pictures ..."."""
+    """Return why an attempt placed no camera: "the pictures ..."."""
     colmap = require_pycolmap()
     kinds = colmap.TwoViewGeometryConfiguration
     with _opened(colmap, work / attempt.database) as content:
@@ -123,7 +123,7 @@ def cause_of_nothing(work: Path, attempt: Attempt) -> str:
 
 @contextmanager
 def _quiet(colmap: Any) -> Iterator[None]:
-    """Let COLMAP log nothing but its own end: what goes wrong is found in its results and said in our words."""
+    """Silence COLMAP's log except for fatal errors: failures are detected in its results and reported in our words."""
     before = colmap.logging.minloglevel
     colmap.logging.minloglevel = int(colmap.logging.FATAL)
     try:
@@ -134,7 +134,7 @@ def _quiet(colmap: Any) -> Iterator[None]:
 
 @contextmanager
 def _room_asked_for(work: Path) -> Iterator[None]:
-    """Find out whether the disk is full where COLMAP fails, which does not say so."""
+    """Check whether the disk is full if COLMAP fails, as COLMAP does not say so."""
     try:
         yield
     except RuntimeError:
@@ -143,7 +143,7 @@ def _room_asked_for(work: Path) -> Iterator[None]:
 
 
 def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
-    """Return the names that share a camera, group by group, and those that have a camera each."""
+    """Return groups of names that share a camera, and the names that each have their own."""
     if mode == "per_image":
         return [], [p.name for p in photographs]
     if mode == "single":
@@ -170,9 +170,9 @@ def _find_features(
     attempt: Attempt,
     report: Report,
 ) -> None:
-    """Find features a few photographs at a time, so that progress shows and Ctrl-C is heard."""
+    """Find features a few photographs at a time, to show progress and react to Ctrl-C."""
     options = colmap.FeatureExtractionOptions()
-    # Whatever the default: where the wheel has no ONNX, learned features end the process.
+    # Whatever the default: if the wheel lacks ONNX, learned features abort the process.
     options.type = colmap.FeatureExtractorType.SIFT
     options.use_gpu, options.num_threads = False, settings.threads
     options.max_image_size, options.sift.max_num_features = settings.max_image_size, attempt.num_features
@@ -182,7 +182,7 @@ def _find_features(
     report(FEATURES, 0.0)
     for names, mode in [*((group, colmap.CameraMode.SINGLE) for group in shared), (alone, colmap.CameraMode.PER_IMAGE)]:
         reader = colmap.ImageReaderOptions()
-        # One photograph does not settle more than one term of a lens.
+        # One photograph does not determine more than one term of a lens.
         is_free = mode == colmap.CameraMode.PER_IMAGE and lens == SfmSettings.camera_model
         reader.camera_model = OF_ONE_PHOTOGRAPH if is_free else lens
         for start in range(0, len(names), settings.threads):
@@ -219,7 +219,7 @@ def _match(
     pairing = colmap.ImportedPairingOptions()
     pairing.match_list_path = str(pair_list)
     pairs = image_pairs(settings.matching, len(photographs))
-    # The list is cut at spaces, and names may have some.
+    # The list is split at spaces, and names may contain some.
     plain = {photograph.name: f"{number:06d}" for number, photograph in enumerate(photographs)}
     _rename(colmap, database, plain)
     done = 0
@@ -251,7 +251,7 @@ def _opened(colmap: Any, database: Path) -> Iterator[Any]:
 def _mapped(
     colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
 ) -> list[Any]:
-    """Return what is reconstructed photograph after photograph, the largest model first."""
+    """Return the models of incremental reconstruction, the largest first."""
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = settings.threads, settings.seed
     options.min_model_size = FEWEST_REGISTERED
@@ -261,7 +261,7 @@ def _mapped(
     make_folder(models)
 
     def advance() -> None:
-        # A second model starts again with its first pair; the bar stays full while it is tried.
+        # A second model starts again with a first pair; the bar stays full while it is tried.
         report(MAPPING, next(placed))
 
     advance()
@@ -274,7 +274,7 @@ def _mapped(
 def _mapped_globally(
     colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
 ) -> list[Any]:
-    """Return what is reconstructed of all photographs at once (GLOMAP, arXiv 2407.20219)."""
+    """Return the models of global reconstruction (GLOMAP, arXiv 2407.20219)."""
     options = colmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = settings.threads, settings.seed
     report(MAPPING, 0.0)

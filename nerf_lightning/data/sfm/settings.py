@@ -1,4 +1,4 @@
-"""Settings of structure from motion, what is tried in turn, and what its stages cost."""
+"""Settings of structure from motion, the attempts in order, and the costs of its stages."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,17 +19,17 @@ MAPPERS: tuple[Literal["incremental", "global"], ...] = ("incremental", "global"
 
 @dataclass(frozen=True)
 class SfmSettings:
-    """How structure from motion is done.
+    """Settings of structure from motion.
 
     Args:
-        matching: which photographs are compared: all pairs, neighbors in the order of names, or by their number.
+        matching: which photographs are compared: all pairs, neighbors in the order of names, or chosen by their number.
         camera_mode: one camera for all, one each, or one per size and EXIF focal length.
         camera_model: COLMAP's name of the lens model; panoramas have one of their own.
         panoramas: whether the images are equirectangular panoramas; auto: if they say so, or if all are exactly twice
             as wide as high.
-        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 2048, and other ways where
-            photographs are left out (`attempts`).
-        max_image_size: the longer side in pixels to which photographs are shrunk for finding features.
+        num_features: maximum number of features per photograph; auto: 8192, or 2048 for more than 24 photographs, and
+            further attempts if photographs are left out (`attempts`).
+        max_image_size: longer side in pixels to which photographs are shrunk to find features.
         num_threads: None uses every core. Two runs are identical only with one thread.
         seed: of the random numbers.
 
@@ -63,13 +63,13 @@ class Attempt:
 
     num_features: int
     affine: bool = True
-    """Whether features have an affine shape, and so look alike from other viewpoints."""
+    """Whether features have an affine shape, and so look similar from other viewpoints."""
     mapper: Literal["incremental", "global"] = "incremental"
-    """Photograph after photograph, or all at once."""
+    """One photograph after the other, or all at once."""
 
     @property
     def database(self) -> str:
-        """The name of the file that keeps its features and their matches, which both mappers share."""
+        """The name of the file with its features and matches, which both mappers share."""
         return f"{self.num_features}{'_affine' if self.affine else ''}.db"
 
     def __str__(self) -> str:
@@ -78,7 +78,7 @@ class Attempt:
 
 
 def attempts(settings: SfmSettings, count: int) -> list[Attempt]:
-    """Return what is tried for `count` photographs, one after the other while photographs are left out.
+    """Return the attempts for `count` photographs, in order, until no photograph is left out.
 
     >>> [str(attempt) for attempt in attempts(SfmSettings(), 50)][:2]
     ['2048 round features', 'all cameras placed at once']
@@ -95,7 +95,7 @@ def attempts(settings: SfmSettings, count: int) -> list[Attempt]:
 
 
 def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings, attempt: Attempt) -> dict[str, float]:
-    """Return the seconds that each stage would take on one thread of an ordinary machine, roughly."""
+    """Return roughly how many seconds each stage takes on one thread of an ordinary machine."""
     num_pairs = len(image_pairs(settings.matching, len(photographs)))
     shrunk = [(p, min(1.0, settings.max_image_size / max(p.width, p.height))) for p in photographs]
     megapixels = sum(p.width * p.height * scale**2 / 1e6 for p, scale in shrunk)

@@ -1,4 +1,4 @@
-"""What a person is told of poses that were found."""
+"""Summarize found poses for the user."""
 
 from pathlib import Path
 
@@ -6,12 +6,12 @@ from nerf_lightning.data.sfm.reconstruction import SparseModel
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.escaping import listed
 
-# Of the photographs: where fewer were registered, there is advice.
+# Share of the photographs: if fewer were registered, give advice.
 ENOUGH = 0.8
 
 
 def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Path, seconds: float) -> list[str]:
-    """Return what was found and written to `folder`, line by line, with advice where it is little."""
+    """Return what was found and written to `folder` as lines, with advice if it is little."""
     found, total = len(model.registered), len(model.registered) + len(model.left_out)
     what = "frames" if is_video else "photographs"
     cameras = "one camera" if model.num_cameras == 1 else f"{model.num_cameras} cameras"
@@ -28,7 +28,7 @@ def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Pat
 
 
 def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
-    """Return what to do differently, where there is something."""
+    """Return what to do differently, if anything."""
     lines = []
     if model.apart:
         lines.append(

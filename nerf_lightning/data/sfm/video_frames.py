@@ -1,4 +1,4 @@
-"""Sharp frames of a video: of every few consecutive frames the one that is blurred least. Only videos are opened."""
+"""Sharp frames of a video: the least blurred of every few consecutive frames. Only videos are opened."""
 
 import logging
 import math
@@ -21,27 +21,27 @@ from nerf_lightning.messages.errors import InputError
 FRAMES_WANTED = 100
 SHARPNESS_SIDE = 480
 JPEG_QUALITY = 95
-# Of its fine details, what a blurred frame keeps when it is blurred again. Sharp photographs keep a tenth, and nine
-# tenths once they are blurred by two pixels.
+# Share of its fine details that a blurred frame keeps when it is blurred again. Sharp photographs keep a tenth, and
+# nine tenths after a blur of two pixels.
 BLURRED = 0.7
-# Nothing but the file itself is opened.
+# Only the file itself is opened.
 INPUT = ["-protocol_whitelist", "file"]
 COPIED = re.compile(rb"^Output #0.*?Video: .*?, (\d+)x(\d+).*\bframe= *(\d+)", re.DOTALL | re.MULTILINE)
-"""Of what ffmpeg says: width and height of the stream, and how many frames it has copied. What it repeats of the file
-itself, such as a title, begins no line."""
-# Else frames are repeated where they come at uneven times, as phones film.
+"""In ffmpeg's output: width and height of the stream, and the number of copied frames. Text from the file itself, such
+as a title, never begins a line."""
+# Otherwise frames are repeated if they come at uneven times, as from phones.
 EACH_ONCE = ["-fps_mode", "passthrough"]
 
-# It warns that films which were held upright have another size than their stream.
+# It warns that the size of films taken in portrait orientation differs from their stream's.
 logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Return the variance of the Laplacian of a small gray version: the higher, the sharper.
+    """Return the variance of the Laplacian of a small gray version: higher is sharper.
 
     The measure of Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000. It compares frames
     of one scene; a blank wall is never sharp. The frame is first averaged down to at most 480 pixels or so on its
-    longer side, which takes noise away and leaves what moves across pixels when a camera shakes.
+    longer side, which removes noise and keeps motion across pixels from camera shake.
 
     >>> sharpness(np.full((20, 20, 3), 128, dtype=np.uint8))
     0.0
@@ -50,10 +50,10 @@ def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
 
 
 def is_blurred(frame: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Return whether a frame has no details as fine as its pixels could show, in a small gray version.
+    """Return whether a small gray version of a frame lacks details as fine as its pixels could show.
 
-    What is sharp loses most of its fine details in a blur of one pixel; what was blurred before has none to lose
-    (after Crete et al., "The blur effect", 2007). A blank frame counts as blurred.
+    A sharp frame loses most of its fine details in a blur of one pixel; a blurred one has none to lose (after Crete et
+    al., "The blur effect", 2007). A blank frame counts as blurred.
     """
     grey = _small_grey(frame)
     return _roughness(grey.filter(ImageFilter.GaussianBlur(1.0))) >= BLURRED * _roughness(grey)
@@ -70,12 +70,12 @@ def _roughness(grey: Image.Image) -> float:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames a video has; refuse what is no video."""
+    """Return how many frames a video has; refuse files that are not videos."""
     import imageio_ffmpeg
 
     require_video(path)
     most = limits().video_frames
-    # Packets are copied: decoding them would take as long as the film, and small ones can be of any size.
+    # Packets are copied: decoding them would take as long as the film, and small packets can decode to any size.
     copied = ("-map", "0:v:0", "-map_metadata", "-1", "-c", "copy", "-frames:v", str(most + 1), "-f", "null", "-")
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *INPUT, "-i", str(path), *copied]
     result = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
@@ -89,7 +89,7 @@ def count_frames(path: Path) -> int:
 
 
 def frame_stride(num_frames: int, every: int | None) -> int:
-    """Return how many consecutive frames one is chosen from: as given, else so that about a hundred are left.
+    """Return how many consecutive frames one is chosen from: `every`, else such that about a hundred are left.
 
     >>> frame_stride(1000, None), frame_stride(30, None), frame_stride(1000, 4)
     (10, 1, 4)
@@ -98,19 +98,19 @@ def frame_stride(num_frames: int, every: int | None) -> int:
 
 
 def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[int], None] = lambda count: None) -> int:
-    """Write the sharpest of every `every` frames as frame_000123.jpg, by its number in the video; return how many.
+    """Write the sharpest of every `every` frames as frame_000123.jpg, by its number in the video; return the count.
 
-    Frames come upright, and those of HDR films tone-mapped; a shorter last group counts as one; `seen` is called with
+    Frames are upright, and tone-mapped if the film is HDR; a shorter last group counts as one; `seen` is called with
     the number of frames read so far.
 
     Raises:
-        InputError: not a video, or one without frames.
+        InputError: the file is not a video, or has no frames.
     """
     with _named(video):
         transfer = hdr_transfer(video, INPUT)
     written, sharpest = 0, -1.0
     for index, frame in enumerate(_frames(video)):
-        # Only the best so far is kept: a group of large frames would be gigabytes.
+        # Only the best frame so far is kept: a group of large frames would take gigabytes.
         if (here := sharpness(frame)) > sharpest:
             sharpest, best, number = here, frame, index
         seen(index + 1)
@@ -136,7 +136,7 @@ def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
 
 @contextmanager
 def _named(video: Path) -> Iterator[None]:
-    """Say of what ffmpeg cannot read that it is no video."""
+    """Report files that ffmpeg cannot read as not being videos."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, IndexError) as error:
@@ -156,14 +156,14 @@ STARTS = (
     *(b"\x30\x26\xb2\x75\x8e\x66\xcf\x11", b"GIF87a", b"GIF89a"),
 )
 BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
-"""What an mp4 or QuickTime file begins with, after four bytes of length."""
+"""The beginning of an mp4 or QuickTime file, after four bytes of length."""
 PACKETS = ((0, 188), (4, 192))
 """First byte and length of the packets of an MPEG transport stream."""
 SYNC = 0x47
 
 
 def require_video(path: Path) -> None:
-    """Refuse what is no container of video, and say what is read."""
+    """Refuse files that are not video containers, and name those that are read."""
     with open_regular(path, "video") as file:
         start = file.read(600)
     known = start.startswith(STARTS) or start[4:8] in BOXES

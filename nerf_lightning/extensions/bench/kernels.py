@@ -16,7 +16,7 @@ POINTS, RAY_SAMPLES = 65_536, 32
 
 
 def compared_kernels(device: torch.device) -> dict[str, dict[str, Callable[[], None]]]:
-    """Return our kernels with what torch does in their place, forward and backward; "ours" comes first."""
+    """Return our kernels and torch's equivalents, forward and backward; "ours" comes first."""
     compared = {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device, "float32")}
     if device.type != "cpu" or cpu_multiplies_bfloat16():
         compared["MLP 32-64-64-3 in bfloat16"] = _mlp(device, "bfloat16")
@@ -24,7 +24,7 @@ def compared_kernels(device: torch.device) -> dict[str, dict[str, Callable[[], N
 
 
 def points_along_rays(device: torch.device) -> Tensor:
-    """Return points of the unit cube as rays meet them: neighbors lie close together."""
+    """Return points of the unit cube in the order of rays: neighbors are close together."""
     start = torch.rand(POINTS // RAY_SAMPLES, 1, 3)
     along = 0.003 * torch.nn.functional.normalize(torch.randn_like(start), dim=-1)
     points = start + along * torch.arange(RAY_SAMPLES)[:, None]

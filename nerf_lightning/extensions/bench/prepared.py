@@ -1,7 +1,7 @@
-"""`nerf bench`: the model, its data and its optimizer, ready to be trained on and rendered, our way or plainly.
+"""`nerf bench`: the model, its data and its optimizer, ready for training and rendering, our way or plainly.
 
-"Plain" is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid
-kernel, no screening of what lies behind opaque samples.
+"Plain" is the same mathematics in a straightforward implementation: float32, whole batches, torch around the same hash
+grid kernel, no screening of samples behind opaque ones.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ from nerf_lightning.training.fastest_tile import measured_tile
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
-# Without these, torch computes around the kernels of hash grids, random numbers and histograms.
+# Without these, torch computes everything except hash grids, random numbers and histograms.
 TWINS = (
     *("march.cpu", "ragged.cpu", "mlp.cpu", "table_adam.cpu", "render.cpu", "render.gradients"),
     *("march.cuda", "ragged.cuda", "mlp.cuda", "table_adam.cuda", "render.cuda"),
@@ -52,7 +52,7 @@ class Bench:
 
     @cached_property
     def batch(self) -> Batch:
-        """The batch that every kind gets, as large as batches are once the model has been trained."""
+        """The batch for every kind, with the batch size of a trained model."""
         return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
 
     def train(self, steps: int) -> None:
@@ -61,18 +61,18 @@ class Bench:
             self.train_on(self.batch)
 
     def train_on(self, batch: Batch) -> None:
-        """Compute gradients and update; where training replays steps, by a replay, with its guard against NaN."""
+        """Compute gradients and update; if training replays steps, by a replay, with its NaN guard."""
         self._update(self.optimizer, lambda: self.train_step.gradients(batch, self.train_step.key))
 
     def train_one_by_one(self, steps: int) -> None:
-        """Take steps on the one batch, whole as in a replay, whose kernels are launched one by one."""
+        """Take steps on the one batch, without tiles as in a replay, launching kernels one by one."""
         self.train_step.tiles.points = None
         for _ in range(steps):
             self._update(self.optimizer, lambda: self.train_step.tiles(self.batch, key=0))
         self.train_step.tiles.points = self.settings.tile_points
 
     def train_plainly(self, steps: int) -> None:
-        """Take steps on the one batch as one would first write them."""
+        """Take steps on the one batch with the straightforward implementation."""
         with self._plainly():
             for _ in range(steps):
                 self._update(self.plain_optimizer, lambda: self.train_step.tiles(self.batch, key=0))
@@ -83,7 +83,7 @@ class Bench:
         optimizer.step()
 
     def take_step(self) -> None:
-        """Take one step of training, loading and all."""
+        """Take one step of training, including loading."""
         progress = self.batches.progress
         batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
         self.train_step(batch, self.optimizer)
@@ -94,7 +94,7 @@ class Bench:
         model, background = self.train_step.objective.model, self.train_step.objective.background
         with torch.no_grad():
             rays = self.train_step.objective.rays(self.batch.pixels[places])
-            if not plain:  # as pictures are
+            if not plain:  # like pictures
                 render_rays(model, rays, background, self.settings.inference_tile_points)
                 return
             with self._plainly():
@@ -125,7 +125,7 @@ class Bench:
 
 
 def prepare(config: DictConfig, scene: Scene) -> Bench:
-    """Build what is to be measured."""
+    """Build what is measured."""
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     progress = Progress()

@@ -1,4 +1,4 @@
-"""`nerf bench`: where the time of a step goes: its stages, waiting for the batch, arithmetic."""
+"""`nerf bench`: how the time of a step is spent: its stages, waiting for the batch, arithmetic."""
 
 from collections.abc import Callable
 
@@ -16,10 +16,10 @@ from nerf_lightning.training.step import TrainStep
 
 
 def stage_seconds(train_step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-    """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing.
+    """Return a packed model's seconds of marching, screening, the rest of both passes, and the update; else nothing.
 
-    Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest. Neither has a
-    step that is replayed.
+    If one kernel takes rays from marching to color, there are no stages: both passes are the rest. A replayed step has
+    no stages either.
     """
     level = next((part for part in train_step.objective.model.modules() if isinstance(part, RaggedLevel)), None)
     if level is None or train_step.gradients.replays:
@@ -38,7 +38,7 @@ def stage_seconds(train_step: TrainStep, batch: Batch, optimizer: torch.optim.Op
 
 
 class LoadedSteps:
-    """Take steps, so many at a time, whose batches come from the loader, and note how long each was waited for."""
+    """Take `steps` steps at a time with batches from the loader, and record the waiting time for each batch."""
 
     def __init__(self, batches: RayBatches, train_on: Callable[[Batch], None], steps: int):
         self.batches, self.train_on, self.steps = batches, train_on, steps
@@ -64,7 +64,7 @@ MATRIX_FLOPS = 2 * _ROWS * _WIDTH**2 * _REPEATS
 
 
 def multiplication(settings: TrainerSettings) -> Callable[[], None]:
-    """Return work of `MATRIX_FLOPS`, in the precision of training."""
+    """Return a function that performs `MATRIX_FLOPS`, in the training precision."""
     dtype = torch.bfloat16 if settings.precision.startswith("bf16") else torch.float32
     left = torch.randn(_ROWS, _WIDTH, device=settings.device).to(dtype)
     right = torch.randn(_WIDTH, _WIDTH, device=settings.device).to(dtype)
@@ -79,10 +79,10 @@ def multiplication(settings: TrainerSettings) -> Callable[[], None]:
 
 def flops_per_ray(train_step: TrainStep, batch: Batch) -> float:
     """Count the operations that training takes per ray, forward and backward, in matrix products."""
-    # Where rays differ in their samples, many make the mean.
+    # If rays differ in their samples, average over many.
     few = 8 if train_step.objective.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
-    # It sees torch's own operations, of its own thread.
+    # It counts torch's own operations, in its own thread.
     kernels = "mlp.cpu", "mlp.cuda", "render.gradients", "render.dense"
     with torch_threads(1), FlopCounterMode(display=False) as counter, without(*kernels):
         train_step.tiles(rays, key=0)

@@ -1,4 +1,4 @@
-"""A regular grid of points over a scene's box, and what a model says there."""
+"""A regular grid of points over a scene's box, and the model's density at them."""
 
 import math
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-CHUNK = 1 << 18  # Points of which coordinates are held at a time; a report follows each.
+CHUNK = 1 << 18  # Points whose coordinates are held at a time; progress is reported after each chunk.
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Lattice:
 
     @classmethod
     def over(cls, aabb: Float[Tensor, "2 3"], resolution: int) -> "Lattice":
-        """Return the lattice that cuts the longest side of a box into `resolution` cells, and covers all of it.
+        """Return the lattice that divides the longest side of a box into `resolution` cells, and covers all of it.
 
         >>> Lattice.over(torch.tensor([[0.0, 0, 0], [4, 2, 1]]), 4).shape
         (5, 3, 2)
@@ -45,22 +45,22 @@ class Lattice:
 
     @property
     def num_points(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return math.prod(self.shape)
 
     def points(self, part: slice) -> Float[Tensor, "points 3"]:
-        """Return the points numbered from `part.start` to `part.stop`, the last axis running first."""
+        """Return the points numbered from `part.start` to `part.stop`; the last axis varies fastest."""
         index = torch.arange(part.start, part.stop)
         _, y, z = self.shape
         cell = torch.stack([index // (y * z), index // z % y, index % z], dim=-1)
         return (self.lower + self.spacing * cell).float()
 
     def to_scene(self, index: Float[ndarray, "points 3"]) -> Float[ndarray, "points 3"]:
-        """Return where fractional numbers (i, j, k) lie."""
+        """Return the positions of fractional indices (i, j, k)."""
         return (self.lower.numpy() + self.spacing * index).astype(np.float32)
 
     def chunks(self) -> Iterator[slice]:
-        """Return parts of all points, of a handy size."""
+        """Yield all points in parts of a convenient size."""
         return tiles(self.num_points, CHUNK)
 
 
@@ -79,7 +79,7 @@ def sample_density(
 
 
 def require_resolution(record: SceneRecord, resolution: int, bytes_per_point: int) -> Lattice:
-    """Return the lattice over the scene's box, of 2 cells or more that memory holds."""
+    """Return the lattice over the scene's box; refuse fewer than 2 cells, or more than fit into memory."""
     if resolution < 2:
         raise InputError(f"what.resolution={resolution}: give the number of cells along the longest side, 2 or more.")
     lattice = Lattice.over(record.aabb, resolution)

@@ -1,6 +1,6 @@
-"""The surface where the density crosses a level, as a mesh: closed, the insides of things included.
+"""The surface where the density crosses a level, as a mesh: closed, including the insides of objects.
 
-Marching cubes (Lewiner et al. 2003) are scikit-image's; what floats is removed.
+Marching cubes (Lewiner et al. 2003) are scikit-image's; floaters are removed.
 """
 
 import logging
@@ -24,7 +24,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 BYTES_PER_POINT = 8  # The density's grid, and as much again for the mesh.
-RATIO = 10.0  # So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
+RATIO = 10.0  # This many times the surface's density counts as solid, and 1 / RATIO of it as empty.
 
 log = logging.getLogger(__name__)
 
@@ -40,15 +40,16 @@ def mesh_of_density(
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
     """Return vertices (scene frame) and faces of the surface where the density is `threshold` per scene unit.
 
-    Without a threshold, that is where rendering sees it (`surface_level`). `closed`: also at the sides of the box.
+    Without a threshold, the surface is where rendering sees it (`surface_level`). `closed`: also at the sides of the
+    box.
     """
     density = sample_density(model, lattice, tile_points, report)
-    if closed or record.space == "bounded":  # Of a bounded scene, nothing lies outside.
+    if closed or record.space == "bounded":  # Nothing is outside a bounded scene.
         for axis in range(3):
             sides = np.moveaxis(density, axis, 0)
             sides[0] = sides[-1] = 0.0
     level = _level(model, record, density, threshold, tile_points)
-    # Densities grow by factors, and so the logarithm of their ratio to the level is straight.
+    # Densities grow exponentially, so the logarithm of their ratio to the level is linear.
     density /= level
     np.clip(density, 1.0 / RATIO, RATIO, out=density)
     np.log(density, out=density)
@@ -78,20 +79,20 @@ def _level(
 def marching_cubes(
     density: Float[ndarray, "x y z"], level: float, report: Report
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside."""
+    """Return the surface density = level: vertices in units of cells, and faces, counterclockwise from outside."""
     measure = require_library("skimage.measure")
     if not density.min() < level < density.max():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
     vertices, faces, _, _ = measure.marching_cubes(density, level)
     report("surface", 1.0)
-    # scikit-image's run clockwise where what is dense lies inside.
+    # scikit-image's are clockwise if the inside is dense.
     return vertices, np.ascontiguousarray(faces[:, ::-1])
 
 
 def without_floaters(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], least_share: float
 ) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"], int]:
-    """Return the connected parts that have at least this share of the largest one's faces, and how many have not."""
+    """Return the connected parts with at least this share of the largest one's faces, and the number of others."""
     part = _part_of_face(len(vertices), faces)
     num_faces = np.bincount(part)
     large = num_faces >= least_share * num_faces.max()
@@ -101,7 +102,7 @@ def without_floaters(
 def without_cavities(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
 ) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"]]:
-    """Return the connected parts of a closed mesh that hold matter: the surface of a cavity has a negative volume."""
+    """Return the connected parts of a closed mesh that enclose matter: the surface of a cavity has negative volume."""
     a, b, c = vertices[faces.T].astype(np.float64)
     volumes = (a * np.cross(b, c)).sum(axis=1) / 6.0
     part = _part_of_face(len(vertices), faces)
@@ -125,9 +126,9 @@ def _only(
 
 
 VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.
-TOLERANCE = 0.015  # A vertex is seen where a view's depth is its distance, up to this share of it.
-OPAQUE = 0.5  # Pixels that stop less light see no surface.
-RINGS = 2  # The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
+TOLERANCE = 0.015  # A vertex is visible if a view's depth equals its distance, up to this share of it.
+OPAQUE = 0.5  # Pixels with lower opacity see no surface.
+RINGS = 2  # Rings of faces that are added around visible ones, to avoid holes at grazing angles and thin parts.
 
 
 def seen_faces(
@@ -138,7 +139,7 @@ def seen_faces(
     tile_points: int,
     report: Report,
 ) -> Int[ndarray, "seen 3"]:
-    """Return the faces that a training view sees, or whose neighbors it does, of which there must be some."""
+    """Return the faces that a training view sees, and their neighbors; refuse a mesh without any."""
     cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
     points = torch.from_numpy(vertices).float()
     seen = torch.zeros(len(points), dtype=torch.bool)

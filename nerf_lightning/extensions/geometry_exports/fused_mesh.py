@@ -1,4 +1,4 @@
-"""The surface that the views see, as a mesh: their rendered depth, fused to one truncated signed distance."""
+"""The surface that the views see, as a mesh: their rendered depth, fused into one truncated signed distance."""
 
 from dataclasses import replace
 
@@ -23,23 +23,23 @@ from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import median_distances
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 
-BYTES_PER_POINT = 12  # The distance and its weight; and as much as one of them again for the mesh.
-# Views that are fused, and the longer side of their pictures: as many pixels as the grid has cells, but so many
-# at most.
+BYTES_PER_POINT = 12  # The distance, its weight, and as much as one of them for the mesh.
+# Maximum number of fused views, and of pixels of the longer side of their pictures, which otherwise equals the grid's
+# cells.
 VIEWS, LONGEST = 60, 512
-OPAQUE = 0.5  # Pixels that stop less light see through the box.
-# A view at a grazing angle says little; of nothing, less than of something; a coarse one, less than a fine one.
+OPAQUE = 0.5  # Pixels with lower opacity see through the box.
+# A view at a grazing angle counts little; an empty pixel less than a surface; a coarse view less than a fine one.
 LEAST_COSINE, NOTHING, LEAST_SHARE = 0.05, 0.3, 0.25
-# Half of what one view counts that looks squarely: a surface that all of them see less well is not there.
+# Half the weight of one view that faces the surface: surfaces with less total weight are discarded.
 LEAST_WEIGHT = 0.5
 
 
 def mesh_of_depth(
     model: Model, record: SceneRecord, lattice: Lattice, truncation: float, tile_points: int, report: Report
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Return vertices (scene frame) and faces of the surface that training views see, open where none looks.
+    """Return vertices (scene frame) and faces of the surface that training views see; it is open where none looks.
 
-    `truncation` says how far before and behind a surface its distance is kept, in cells.
+    `truncation` is the distance in cells before and behind a surface within which distances are kept.
     """
     fuse = require_kernels(
         f"{__package__}.tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or use what.surface=density."
@@ -73,7 +73,7 @@ def mesh_of_depth(
 def _known(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], weight: Float[ndarray, "x y z"]
 ) -> ndarray:
-    """Tell the faces of cells whose eight corners are known: elsewhere the surface would part what no view tells."""
+    """Return which faces are in cells whose eight corners are known: elsewhere the surface would be made up."""
     cell = np.floor(vertices[faces].mean(axis=1)).astype(np.int64)
     cell = np.minimum(cell, np.array(weight.shape) - 2)
     known = np.ones(len(faces), bool)
@@ -85,10 +85,10 @@ def _known(
 def depth_view(
     model: Model, background: Background, rays_of: RayGenerator, view: int, spacing: float, tile_points: int
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Return what one view says of the surface; `spacing` is that of the grid, in scene units.
+    """Return one view's depth of the surface and its weight; `spacing` is that of the grid, in scene units.
 
-    The distance along each ray at which half of the stopped light was stopped (inf: the ray meets nothing), and how
-    much that counts: the cosine of the angle to the surface, less where a pixel covers many cells.
+    The depth is the distance along each ray at which half of the absorbed light was absorbed (inf: the ray hits
+    nothing); the weight is the cosine of the angle to the surface, reduced if a pixel covers many cells.
     """
     rays = rays_of(all_pixels(rays_of.cameras, view))
     flat = rays.map(lambda part: part.flatten(0, 1)).to(next(model.parameters()).device)
@@ -98,7 +98,7 @@ def depth_view(
         opacities.append(levels[-1].opacity.cpu())
     depth = torch.cat(depths).view(rays.near.shape).float()
     meets = torch.cat(opacities).view(rays.near.shape) > OPAQUE
-    # Differences, which are steep beside an edge: of pixels there it is not known which surface they see.
+    # Differences are steep next to an edge: it is unknown which surface pixels there see.
     down, along = torch.gradient(rays.origins + depth[..., None] * rays.directions, dim=(0, 1))
     normals = normalize(torch.linalg.cross(down, along), dim=-1)
     cosine = (normals * rays.directions).sum(dim=-1).abs().clamp(min=LEAST_COSINE)
@@ -108,9 +108,9 @@ def depth_view(
 
 
 def depth_rays(record: SceneRecord, cells: int) -> RayGenerator:
-    """Return the rays of pinholes that look as training views do: depth is rendered, so no lens is needed.
+    """Return the rays of pinhole cameras with the poses of training views: depth is rendered, so no lens is needed.
 
-    The longer side of a picture has as many pixels as the longest side of the grid has cells.
+    The longer side of a picture has as many pixels as the longest side of the grid has cells, at most `LONGEST`.
     """
     views = [view for view in record.splits["train"] if record.far[view] > record.near[view]]
     chosen = evenly_spaced_subset(views, VIEWS)
@@ -125,7 +125,8 @@ def depth_rays(record: SceneRecord, cells: int) -> RayGenerator:
     return RayGenerator(resized(pinholes, width, height), near, far)
 
 
-# Right, up and back of cameras that together look everywhere, in the axes of one: ahead, left, back, right, up, down.
+# Right, up and back of cameras that together cover all directions, in the axes of one: ahead, left, back, right, up,
+# down.
 CUBE = (
     ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ((0, 0, -1), (0, 1, 0), (1, 0, 0)),

@@ -1,4 +1,4 @@
-"""A mesh of the surface: of the density or of what the views see, cleaned, colored, in the user's frame."""
+"""A mesh of the surface, from the density or from what the views see, cleaned, colored, in the user's frame."""
 
 import logging
 from dataclasses import dataclass
@@ -55,12 +55,12 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 Surface = Literal["density", "tsdf"]
 BYTES_PER_POINT = {"density": density_mesh.BYTES_PER_POINT, "tsdf": fused_mesh.BYTES_PER_POINT}
-# A guess at how the time is shared; the bar corrects itself.
+# Estimated shares of the time; the bar corrects itself.
 COSTS = {"density": {"density": 6.0, "surface": 2.0, "views": 6.0}, "tsdf": {"depth": 12.0, "surface": 2.0}}
 COLORING = {False: {"colors": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
-UNKNOWN = 100.0  # Millimeters: the longest side of a print whose size is not known.
-REACH = 2.0  # In cells: so far the surface may be off to each side.
-# Most faces of a mesh with a texture, where nobody says how many: the charts of more take minutes.
+UNKNOWN = 100.0  # Millimeters: the longest side of a print of unknown size.
+REACH = 2.0  # Maximum error of the surface to each side, in cells.
+# Default maximum number of faces of a textured mesh: charts of more take minutes.
 TEXTURED_FACES = 60_000
 
 log = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class MeshExport(Export):
-    """Write `mesh.ply` (or .obj, .glb, .stl) of what lies in the scene's box, with a color per vertex or a texture.
+    """Write `mesh.ply` (or .obj, .glb, .stl) of the content of the scene's box, with a color per vertex or a texture.
 
     Args:
         resolution: cells along the longest side of the box.
@@ -86,8 +86,8 @@ class MeshExport(Export):
             Needs `pip install '.[texture]'`.
         texture_size: texels along each side of the texture.
         format: the file format. PLY and OBJ use the capture's frame; GLB is one file for browsers, whose root node
-            makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. STL is for printing in
-            3D: a closed mesh without cavities and colors, z up, in millimeters. None: PLY, or GLB with a texture; a
+            makes y up and, if the capture's unit is known, a unit one meter, as glTF requires. STL is for 3D printing:
+            a closed mesh without cavities and colors, z up, in millimeters. None: PLY, or GLB with a texture; a
             textured OBJ comes with an MTL and a PNG.
     """
 
@@ -171,7 +171,7 @@ class MeshExport(Export):
         normals: Float[Tensor, "vertices 3"],
         **look: ndarray,
     ) -> list[Path]:
-        """Write a mesh of the scene's frame in the user's."""
+        """Write a mesh in the scene's frame to files in the user's frame."""
         to_user = record.to_user.double()
         up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
         placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
@@ -206,9 +206,9 @@ class MeshExport(Export):
 
 
 def in_millimeters(vertices: Float[ndarray, "vertices 3"], record: SceneRecord) -> Float[ndarray, "vertices 3"]:
-    """Return vertices of the scene's frame, whose z is up, in millimeters and above z = 0, as printers want them.
+    """Return vertices of the scene's frame, whose z is up, in millimeters and above z = 0, as printers require.
 
-    Where the capture's unit is not known, the longest side is made 100 mm long.
+    If the capture's unit is unknown, the longest side becomes 100 mm long.
     """
     scale = 1e3 * unit_of(record.to_user) * (record.metres_per_unit or 0.0)
     if not scale:
@@ -225,7 +225,7 @@ def in_millimeters(vertices: Float[ndarray, "vertices 3"], record: SceneRecord) 
 def vertex_normals(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
 ) -> Float[ndarray, "vertices 3"]:
-    """Return the mean normal of the faces around each vertex, by their areas, of unit length.
+    """Return the unit mean normal of the faces around each vertex, weighted by area.
 
     >>> vertex_normals(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))[0].round(4).tolist()
     [0.5774000287055969, 0.5774000287055969, 0.5774000287055969]

@@ -1,4 +1,4 @@
-"""Mesh files: PLY, OBJ and GLB, with a normal and a color for each vertex or with a texture, by optional libraries."""
+"""Mesh files: PLY, OBJ and GLB, with normals and colors of vertices or with a texture, by optional libraries."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,21 +23,21 @@ MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points 
 
 @dataclass(frozen=True)
 class GltfFrame:
-    """How vertices become glTF's, where y is up and a unit is a meter: the root node turns and scales their frame.
+    """The conversion to glTF, where y is up and a unit is a meter: the root node rotates and scales the frame.
 
-    PLY and OBJ say nothing of up and of units, and keep the frame.
+    PLY and OBJ define neither up nor units, and keep the frame.
     """
 
     up: Float[ndarray, "3"]
     """The unit vector that points up, in the frame of the vertices."""
     metres: float
-    """How long a unit of that frame is; where nobody knows, 1."""
+    """Length of a unit of that frame in meters; 1 if unknown."""
 
     def __call__(self, tree: dict[str, Any]) -> None:
-        """Place the root node, and let no viewer add light of its own: it is in the colors already."""
+        """Set the root node's transform, and disable lighting in viewers: it is already in the colors."""
         (root,) = tree["scenes"][tree["scene"]]["nodes"]
         placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(torch.from_numpy(self.up)).numpy()
-        tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
+        tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # in column-major order
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
         rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
         tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
@@ -53,10 +53,10 @@ def save_mesh(
     frame: GltfFrame,
     colors: UInt8[ndarray, "vertices 3"],
 ) -> list[Path]:
-    """Write a mesh with an sRGB color per vertex, whole or not at all; the ending says in which format."""
+    """Write a mesh with an sRGB color per vertex atomically; the extension determines the format."""
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
-    if form == "glb":  # glTF takes the bytes of vertices' colors for linear light
+    if form == "glb":  # glTF interprets vertex colors as linear light
         colors = np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
     settings: dict[str, dict[str, Any]] = {
@@ -93,9 +93,9 @@ def save_textured_mesh(
     uv: Float[ndarray, "vertices 2"],
     picture: UInt8[ndarray, "height width 3"],
 ) -> list[Path]:
-    """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
+    """Write a textured mesh as GLB, or as OBJ with its MTL and PNG next to it, and return the files.
 
-    Each is whole or not there; the OBJ, which names the others, comes last. `uv` says where each vertex lies in the
+    Each is written atomically; the OBJ, which names the others, comes last. `uv` is the place of each vertex in the
     picture (sRGB), from 0 to 1, to the right and up.
     """
     trimesh = require_library("trimesh")
@@ -104,7 +104,7 @@ def save_textured_mesh(
     if form == "glb":
         material = visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     else:
-        # Full ambient and diffuse light and no highlights: the light is in the colors already.
+        # Full ambient and diffuse light and no highlights: the light is already in the colors.
         material = visual.material.SimpleMaterial(image, ambient=[1.0] * 3, diffuse=[1.0] * 3, specular=[0.0] * 3)
         material.name = path.stem
     textured = visual.TextureVisuals(uv=uv, material=material)
@@ -123,5 +123,5 @@ def save_textured_mesh(
 
 
 def require_library(name: str, extra: str = "mesh") -> Any:
-    """Return a module of an extra, or say how it is installed."""
+    """Return a module of an extra, or report how to install it."""
     return require_extra(name, extra, f"Exporting {MADE_BY[extra]}")

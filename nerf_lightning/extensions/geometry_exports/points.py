@@ -27,11 +27,11 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-# What all views' points are held in until they are confirmed, and the picture of each; then once more, as one cloud.
+# For all views' points until they are confirmed, each view's picture, and a copy as one cloud.
 BYTES_PER_PIXEL = 90
-# And of those that are written: in the user's frame, in double precision, and as rows of the file.
+# For the points that are written: in the user's frame, in double precision, and as rows of the file.
 BYTES_PER_POINT = 150
-NEIGHBOURS = 8  # So many of the nearest other views are asked whether they agree.
+NEIGHBOURS = 8  # Number of the nearest other views that are checked for agreement.
 PointFormat = Literal["ply", "las"]
 COSTS = {"depth": 10.0, "agreement": 1.0}
 
@@ -124,7 +124,7 @@ class PointsExport(Export):
         return path
 
     def _require_memory(self, cameras: Cameras) -> None:
-        """Refuse more pixels than memory holds, were they all opaque and confirmed."""
+        """Refuse more pixels than fit into memory if they were all opaque and confirmed."""
 
         def num_pixels(longest: int) -> int:
             small = at_most(cameras, longest)
@@ -163,7 +163,7 @@ def save_points(
     normals: Float[ndarray, "points 3"],
     colors: UInt8[ndarray, "points 3"],
 ) -> None:
-    """Write a point cloud, whole or not at all."""
+    """Write a point cloud atomically."""
     rows = np.empty(len(points), LAYOUT)
     for name, column in zip((*NUMBERS, *COLORS), (*points.T, *normals.T, *colors.T), strict=True):
         rows[name] = column
@@ -177,13 +177,13 @@ def save_points(
         part.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
 
 
-MOST_STEPS = 1e9  # LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
-FINEST = 1e-30  # What a cloud of one place at zero gets.
+MOST_STEPS = 1e9  # LAS stores positions as 32-bit integers; the extent takes from a tenth of this to all of it.
+FINEST = 1e-30  # For a cloud of a single position at zero.
 COLOR_SCALE = 257  # Colors have 16 bits there, full scale: 255 becomes 65535.
 
 
 def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarray, "points 3"]) -> None:
-    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colors, no normals), whole or not at all."""
+    """Write a point cloud as LAS 1.2 (point format 2: positions and sRGB colors, no normals) atomically."""
     laspy = require_library("laspy", "las")
     header = laspy.LasHeader(version="1.2", point_format=2)
     header.generating_software = "nerf-lightning"
@@ -196,10 +196,11 @@ def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarr
 
 
 def scale_and_offset(points: Float[ndarray, "points 3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return the step of the whole numbers, one for all axes, and the place that they count from.
+    """Return the step of the integers, the same for all axes, and their offset.
 
-    The step is the finest power of ten of which the extent takes at most 1e9, but no finer than what double precision
-    tells apart at this distance from zero. The offset is a whole number of steps at or below the least coordinates.
+    The step is the finest power of ten of which the extent takes at most 1e9, but no finer than the resolution of
+    double precision at this distance from zero. The offset is a multiple of the step, at or below the minimum
+    coordinates.
 
     >>> scale, offset = scale_and_offset(np.array([[-3.0, 0.0, 1.0], [5.0, 2.0, 1.5]]))
     >>> scale.tolist(), offset.tolist()

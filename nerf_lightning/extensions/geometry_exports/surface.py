@@ -1,4 +1,4 @@
-"""Which density counts as the surface, and which color its points have, looked at from the photographs' cameras."""
+"""The density of the surface, and the colors of its points as seen from the photographs' cameras."""
 
 from typing import Literal
 
@@ -20,18 +20,18 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-RAYS = 1 << 13  # So many rays of the training views are asked.
-OPAQUE = 0.9  # Rays that stop less light than this have met no surface.
-# Where four fifths of the rays end it is denser than the level. At the median, thin and grazed surfaces have holes;
-# much lower, surfaces swell.
+RAYS = 1 << 13  # Number of rays of the training views that are used.
+OPAQUE = 0.9  # Rays with lower opacity have hit no surface.
+# Four fifths of the rays end at a density above the level. At the median, thin and grazed surfaces have holes; much
+# lower, surfaces swell.
 QUANTILE = 0.2
 
 
 def surface_level(model: Model, record: SceneRecord, tile_points: int) -> float | None:
-    """Return the density (per scene unit) at the surface, or None where no ray meets one in the scene's box.
+    """Return the density (per scene unit) at the surface; None if no ray hits one in the scene's box.
 
-    Rays of the training views are rendered; where each opaque one has half of its light behind it the field is asked
-    for its density. Their first fifth puts the mesh where the pictures see the surface, and leaves few holes.
+    Rays of the training views are rendered; the field's density is evaluated where each opaque one has lost half of its
+    light. The first quintile of these densities puts the mesh where the pictures see the surface, and leaves few holes.
     """
     device = next(model.parameters()).device
     rays, points = _some_rays(record).to(device), []
@@ -45,7 +45,7 @@ def surface_level(model: Model, record: SceneRecord, tile_points: int) -> float 
     if not len(seen):
         return None
     density = torch.cat([point_field(model).density(part.to(device)).cpu() for part in seen.split(tile_points)])
-    density = density[density > 0]  # on the very edge of an empty cell there may be none
+    density = density[density > 0]  # it may be 0 on the very edge of an empty cell
     return float(density.quantile(QUANTILE)) if len(density) else None
 
 
@@ -62,7 +62,7 @@ def _some_rays(record: SceneRecord) -> RayBundle:
 
 
 SeenFrom = Literal["cameras", "normal"]
-SAMPLES = 8  # Of a short ray.
+SAMPLES = 8  # Per short ray.
 
 
 def surface_colors(
@@ -75,10 +75,11 @@ def surface_colors(
     tile_points: int,
     report: Report,
 ) -> UInt8[Tensor, "points 3"]:
-    """Return the color of each point on the surface, in the scene's frame, as the last level has it.
+    """Return the color of each surface point (scene's frame), from the last level.
 
-    A ray of twice `reach` (scene units) passes each. `normal` looks straight at the surface, against its unit outward
-    normal; `cameras` from the training cameras that face it most squarely, and so along directions that were learned.
+    A ray of length twice `reach` (scene units) passes through each. `normal` looks straight at the surface, against its
+    unit outward normal; `cameras` from the training cameras that face it most directly, and so along trained
+    directions.
     """
     device = next(model.parameters()).device
     eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
@@ -102,9 +103,9 @@ def short_rays(
     samples: int,
     closed: bool,
 ) -> DenseRendering:
-    """Return what rays along unit directions see from `before` points to `behind` them, by the last level alone.
+    """Return what rays along unit directions see from `before` points to `behind` them, using only the last level.
 
-    All is in the scene's frame and units; `closed` says whether the light that is left ends there, or goes on.
+    Everything is in the scene's frame and units; `closed` says whether the remaining light ends there, or continues.
     """
     edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
     intervals, origins = RaySamples(edges), at - before * look
@@ -114,14 +115,14 @@ def short_rays(
     return composite(output, intervals, RayBundle(origins, look, near, near + before + behind, look), beyond)
 
 
-NEAREST = 3  # Cameras that are taken of each point.
-PAIRS = 1 << 20  # The ways of all points to all cameras would take gigabytes: so many are held at a time, of 36 bytes.
+NEAREST = 3  # Cameras per point.
+PAIRS = 1 << 20  # All vectors from points to cameras would take gigabytes: this many of 36 bytes are held at a time.
 
 
 def looks_from_nearest(
     points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> Float[Tensor, "looks points 3"]:
-    """Return unit directions to each point from the cameras that stand nearest to it."""
+    """Return unit directions to each point from the cameras nearest to it."""
     parts = []
     for part in tiles(len(points), max(1, PAIRS // len(eyes))):
         away = points[part, None] - eyes
@@ -132,7 +133,7 @@ def looks_from_nearest(
 def looks_from_facing(
     points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> Float[Tensor, "looks points 3"]:
-    """Return unit directions to each point from the cameras that its unit normal points at most squarely."""
+    """Return unit directions to each point from the cameras that its unit normal faces most directly."""
     parts = []
     for part in tiles(len(points), max(1, PAIRS // len(eyes))):
         away = functional.normalize(points[part, None] - eyes, dim=-1)

@@ -1,4 +1,4 @@
-"""Which texels of a picture triangles cover, for the CPU."""
+"""Rasterize triangles into the texels of a picture, on the CPU."""
 
 from typing import no_type_check
 
@@ -11,7 +11,7 @@ from numpy import ndarray
 def covered_texels(
     corners: Float[ndarray, "faces 3 2"], size: int
 ) -> tuple[Int[ndarray, "size size"], Float[ndarray, "size size 3"]]:
-    """Return the number of the face that covers each texel's center (-1: none), and the shares of its corners there.
+    """Return the index of the face that covers each texel's center (-1: none), and its barycentric coordinates there.
 
     `corners` are x to the right and y down, in texels from the upper left corner of the picture.
     """
@@ -43,5 +43,5 @@ def _cover(corners, face, shares):
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    """Run every kernel once on tiny input; errors of the compiler propagate."""
     covered_texels(np.array([[[0, 0], [2, 0], [0, 2]]], np.float32), 2)

@@ -1,4 +1,4 @@
-"""A texture for a mesh: charts that lie flat in one square picture, and the colors that views have of each texel."""
+"""A texture for a mesh: flat charts in one square picture, and the color of each texel from the views."""
 
 from dataclasses import dataclass
 
@@ -26,41 +26,41 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-PADDING = 4  # Texels between charts, so that none shines into another where a viewer mixes neighbors.
-# Training views that are asked which places they see, and how many of them give a texel its color.
+PADDING = 4  # Texels between charts, so that none bleeds into another when a viewer interpolates.
+# Number of training views tested for visibility, and of those that contribute to a texel's color.
 VIEWS, LOOKS = 100, 3
-LEAST_COSINE = 0.1  # Views that see a surface less squarely (cosine) are not asked.
-LEAST_SEEN = 1e-3  # A texel of which less is seen has no color of its own: that of the nearest one that has.
+LEAST_COSINE = 0.1  # Views that see a surface at a smaller cosine are not used.
+LEAST_SEEN = 1e-3  # A less visible texel gets the color of the nearest visible one.
 LEAST_SIZE, LARGEST_SIZE = 16, 16_384
-# Which face and where on it, its color, and the nearest that has one: measured, where charts fill the picture.
+# Face, barycentric coordinates, color, and the nearest texel with a color: measured with charts that fill the picture.
 BYTES_PER_TEXEL = 100
-# Rays of texels begin before the surface by so many times the reach, and have so many samples: nearer, what is hazy
-# after a short training is painted too light; farther costs more and gains nothing that is seen.
+# Rays of texels begin this many times the reach before the surface, with this many samples: nearer, haze after a short
+# training is painted too light; farther costs more without visible gain.
 BEFORE, SAMPLES = 4.0, 20
-TOGETHER = 1 << 16  # Texels that are looked at together; a report follows each lot.
+TOGETHER = 1 << 16  # Texels per chunk; progress is reported after each.
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """A mesh whose vertices each have one place in a picture; where charts end, a vertex of the mesh has several."""
+    """A mesh whose vertices each have one place in a picture; at chart borders, vertices of the mesh are duplicated."""
 
     source: Int[ndarray, "corners"]
-    """Which vertex of the mesh each is."""
+    """The mesh's vertex that each one copies."""
     faces: Int[ndarray, "faces 3"]
     uv: Float[ndarray, "corners 2"]
-    """From 0 to 1: to the right and, as mesh files have it, up."""
+    """From 0 to 1: to the right and, as in mesh files, up."""
 
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels of a picture that show something."""
+    """The texels of a picture that charts cover."""
 
     row: Int[ndarray, "texels"]
     column: Int[ndarray, "texels"]
     corners: Int[ndarray, "texels 3"]
     """The vertices of the mesh around each."""
     shares: Float[ndarray, "texels 3"]
-    """And how near it is to each; they add up to 1."""
+    """Its barycentric coordinates; they add up to 1."""
 
 
 def make_atlas(vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], size: int) -> Atlas:
@@ -86,7 +86,7 @@ def find_texels(atlas: Atlas, size: int) -> Texels:
 
 
 def require_texture_room(size: int) -> None:
-    """Refuse a texture that takes more memory than can be had."""
+    """Refuse a texture that needs more memory than is available."""
     require_memory(
         f"what.texture_size={size} makes a picture of {size} x {size} texels",
         size,
@@ -97,11 +97,12 @@ def require_texture_room(size: int) -> None:
 
 @dataclass
 class TextureMaker:
-    """Look at the places of a mesh from the training cameras that see them best.
+    """Color the surface of a mesh from the training cameras that see it best.
 
-    How well a camera sees a vertex is told by a whole ray; the color of a texel then by a short one, through the
-    surface: what lies farther before it need not be asked about again. Vertices and their unit outward normals are in
-    the scene's frame; `reach` is how far the mesh may be from the surface that the views see, scene units.
+    A full ray measures how well a camera sees a vertex; the color of a texel then takes only a short one, through the
+    surface, as what is farther in front of it need not be evaluated again. Vertices and their unit outward normals are
+    in the scene's frame; `reach` is the maximum distance of the mesh from the surface that the views see, in scene
+    units.
     """
 
     model: Model
@@ -116,7 +117,7 @@ class TextureMaker:
         self.device = next(self.model.parameters()).device
 
     def __call__(self, texels: Texels, size: int, report: Report) -> UInt8[ndarray, "size size 3"]:
-        """Return the picture; between charts the nearest color goes on, so that no seam shows."""
+        """Return the picture; the nearest color continues between charts, so that no seam is visible."""
         scores = self.vertex_scores(report)
         colors = torch.zeros(len(texels.row), 3)
         seen = torch.zeros(len(texels.row), dtype=torch.bool)
@@ -148,7 +149,7 @@ class TextureMaker:
         return scores
 
     def _facing(self, view: int) -> Float[Tensor, "vertices"]:
-        """Return the cosine at which a view's camera sees each vertex; 0 where it does not stand in the picture."""
+        """Return the cosine at which a view's camera sees each vertex; 0 if it is outside the picture."""
         cameras = self.record.cameras
         away = normalize(self.points - cameras.c2w[view, :, 3], dim=-1)
         ahead = (camera_coordinates(cameras, view, self.points)[:, 2] < 0) | (cameras.lens_model == "equirectangular")
@@ -161,7 +162,7 @@ class TextureMaker:
     ) -> tuple[Float[Tensor, "part 3"], Bool[Tensor, "part"]]:
         corners, shares = torch.from_numpy(texels.corners[part]), torch.from_numpy(texels.shares[part])
         at = (shares[..., None] * self.points[corners]).sum(dim=1)
-        # Mixed between the vertices, so that one view takes over from another without an edge.
+        # Interpolated between the vertices, so that views blend without an edge.
         score = sum(shares[:, corner, None] * scores[corners[:, corner]] for corner in range(3))
         best, which = torch.as_tensor(score).topk(min(LOOKS, len(self.views)), dim=1)
         light, weight = torch.zeros(len(at), 3), torch.zeros(len(at))
@@ -179,14 +180,14 @@ class TextureMaker:
         return light / weight.clamp(min=torch.finfo(weight.dtype).tiny)[:, None], weight > LEAST_SEEN
 
     def _arriving(self, at: Float[Tensor, "points 3"], view: int) -> Float[Tensor, "points"]:
-        """Return the share of the light that comes from each place to a view."""
+        """Return the share of the light from each place that reaches a view."""
         record = self.record
         way = at - record.cameras.c2w[view, :, 3]
         distance = way.norm(dim=-1)
         directions, origins = way / distance[:, None], record.cameras.c2w[view, :, 3].expand(at.shape)
         end = distance - self.reach
         near = torch.minimum(record.near[view], end).clamp(min=0.0)
-        # A little beyond the place, since a ray that ends at once would be sampled at the surface alone.
+        # Slightly beyond the place, since a ray of zero length would be sampled only at the surface.
         rays = RayBundle(origins, directions, near, distance + self.reach, directions).to(self.device)
         key, found = fold(0, "surface"), []
         for tile, levels in weighted_renderings(self.model, rays, record.background, key, self.tile_points):

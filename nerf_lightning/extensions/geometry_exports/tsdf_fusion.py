@@ -1,4 +1,4 @@
-"""Depth maps fused on a grid, for the CPU: the mean of truncated distances (Curless and Levoy, SIGGRAPH 1996)."""
+"""Fuse depth maps on a grid, on the CPU: the mean of truncated distances (Curless and Levoy, SIGGRAPH 1996)."""
 
 from typing import no_type_check
 
@@ -22,19 +22,19 @@ def add_view(
     trust: Float[ndarray, "height width"],
     truncation: float,
 ) -> None:
-    """Add what one view says to the running means, in place.
+    """Add one view to the running means, in place.
 
-    A point at distance r from the eye, whose pixel sees its surface at depth d, lies d - r before it. What lies farther
-    before it than the truncation is as good as empty; of what lies farther behind it the view knows nothing.
+    A point at distance r from the eye, whose pixel sees its surface at depth d, is d - r in front of it. Beyond the
+    truncation in front of it, space counts as empty; farther behind it, the view knows nothing.
 
     Args:
-        distance: mean so far of min((d - r) / truncation, 1), of the points at lower + spacing * (i, j, k).
-        weight: sum so far of the weights.
+        distance: running mean of min((d - r) / truncation, 1) at the points lower + spacing * (i, j, k).
+        weight: running sum of the weights.
         lower: of the grid.
         spacing: scene units.
-        camera: camera-to-world row by row, focal lengths, principal point (pixels); a pinhole.
-        depth: distance along each pixel's ray to its surface; inf where it meets none.
-        trust: each pixel's weight; where it is 0, nothing is known.
+        camera: camera-to-world in row-major order, focal lengths, principal point (pixels); a pinhole.
+        depth: distance along each pixel's ray to its surface; inf if there is none.
+        trust: each pixel's weight; 0: nothing is known.
         truncation: scene units.
     """
     shape = distance.shape
@@ -74,7 +74,7 @@ def _add(first, last, distance, weight, across, numbers, camera, depth, trust):
 @njit(error_model="numpy")
 @no_type_check
 def _depth_at(depth, column, line, truncation):
-    """Between the centers of four pixels where they see one surface; else that of the pixel itself."""
+    """Interpolate between four pixel centers if they see one surface; else return the nearest pixel's depth."""
     own = depth[int(line), int(column)]
     j = min(max(int(np.floor(column - HALF)), 0), depth.shape[1] - 2)
     i = min(max(int(np.floor(line - HALF)), 0), depth.shape[0] - 2)
@@ -87,7 +87,7 @@ def _depth_at(depth, column, line, truncation):
 
 
 def trial() -> None:
-    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    """Run every kernel once on tiny input; errors of the compiler propagate."""
     camera = np.array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2, 4, 4, 1, 1], np.float32)
     grid, picture = np.zeros((2, 2, 2), np.float32), np.ones((2, 2), np.float32)
     add_view(grid, grid.copy(), camera[:3], 0.1, camera, picture, picture, 0.2)

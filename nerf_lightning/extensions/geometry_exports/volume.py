@@ -29,7 +29,7 @@ COSTS = {"density": 2.0, "colors": 3.0}
 
 @dataclass
 class VolumeExport(Export):
-    """Write `volume.npz` (density, rgb) and `volume.json`, which says where the grid lies.
+    """Write `volume.npz` (density, rgb) and `volume.json`, which describes the grid's position.
 
     Args:
         resolution: cells along the longest side of the box.

@@ -1,4 +1,4 @@
-"""Coarse scales as frequency features, each weighted by a learned factor, fine scales as a hash grid (Hyb-NeRF)."""
+"""Frequency features with learned factors for coarse scales, and a hash grid for fine scales (Hyb-NeRF)."""
 
 from typing import Literal
 
@@ -15,26 +15,26 @@ from nerf_lightning.nerf.ranges import require_ranges
 
 CONE_OCTAVES = 4
 VECTOR = 16
-"""Kernels for small perceptrons take inputs of whole vectors; zeros make them whole."""
+"""Kernels for small perceptrons take inputs of whole vectors; zeros pad them."""
 
 
 class HybridEncoder(ConeEncoder):
     """(alpha gamma(x), h(x)): gamma of sines and cosines, h of a hash grid, alpha = tanh(MLP(h, cone)), per feature.
 
-    After Hyb-NeRF (arXiv 2311.12490, WACV 2024), whose sizes are told by others. Sines and cosines of low frequencies
-    need no tables, and the factor makes them a function of the place: where the grid has learned that there is nothing
-    of a frequency, it is switched off.
+    After Hyb-NeRF (arXiv 2311.12490, WACV 2024), whose sizes are from other sources. Sines and cosines of low
+    frequencies need no tables, and the factor makes them depend on the position: where the grid has learned that a
+    frequency is absent, it is switched off.
 
     Args:
         coarse: features of the coarse scales, gamma.
-        fine: hash grid of the fine scales, h; None: there is none.
+        fine: hash grid of the fine scales, h; None: no grid.
         factor: the factor of the coarse features: `learnt`, as above, or `one`, which leaves them unchanged.
         width: width of the two hidden layers of the factor's MLP.
         cones: whether the factor also depends on the covariance of the pixel's cone, in squares of the grid's finest
             cell.
 
     Raises:
-        ValueError: a factor is to be learned where there is no grid to learn it from, or cones where it is not learned.
+        ValueError: a learned factor without a grid, or cones without a learned factor.
     """
 
     needs_unit_cube = True
@@ -64,18 +64,18 @@ class HybridEncoder(ConeEncoder):
 
     @property
     def out_dim(self) -> int:
-        """Those of the coarse scales, and those of the fine ones."""
+        """Features of the coarse scales plus those of the fine scales."""
         return self.coarse.out_dim + (0 if self.fine is None else self.fine.out_dim)
 
     def forward(
         self, points: Float[Tensor, "*points 3"], covariance: Float[Tensor, "*points 6"] | None = None
     ) -> Float[Tensor, "*points features"]:
-        """Return the coarse features, weighted, then the fine ones.
+        """Return the weighted coarse features, followed by the fine ones.
 
         Args:
             points: in the unit cube.
             covariance: of the pixels' cones (`geometry.cones`), in units of the cube; None: the points' own features,
-                to which those of ever thinner cones come near.
+                the limit of ever thinner cones.
         """
         return self._joined(points, None if self.fine is None else self.fine(points), covariance)
 
@@ -85,7 +85,7 @@ class HybridEncoder(ConeEncoder):
         features: Float[Tensor, "*points features"],
         covariance: Float[Tensor, "*points 6"] | None = None,
     ) -> Float[Tensor, "*points features"]:
-        """Return the features of points, with gradients: what was looked up in the grid is not looked up again."""
+        """Return the features of points with gradients; values looked up in the grid are reused."""
         if not torch.is_grad_enabled():
             return features
         fine = None
@@ -94,7 +94,7 @@ class HybridEncoder(ConeEncoder):
         return self._joined(points, fine, covariance)
 
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
+        """Reinitialize every parameter from torch's generator."""
         self.coarse.reset_parameters()
         if self.fine is not None:
             self.fine.reset_parameters()
@@ -121,8 +121,8 @@ class HybridEncoder(ConeEncoder):
         return torch.tanh(raw.to(fine.dtype)).view(*fine.shape[:-1], raw.shape[-1])
 
     def _encoded_cone(self, covariance: Tensor) -> Tensor:
-        assert self.fine is not None  # else there is no factor that sees it
+        assert self.fine is not None  # else no factor depends on it
         entries = covariance * float(self.fine.layout.resolutions[-1]) ** 2
-        # A distant cone is many cells wide, and how many is all the same.
+        # A distant cone is many cells wide; how many does not matter.
         entries = entries / (1.0 + entries.abs())
         return self.cone(entries.unflatten(-1, (2, 3))).flatten(-2)

@@ -1,6 +1,6 @@
-"""Models of bricks beside the fire engine: random vehicles and towers, each a function of its number alone.
+"""Models of bricks besides the fire engine: random vehicles and towers, each a function of its number alone.
 
-They differ in what they are, in shape, in colors, in how they are turned and in where the light comes from.
+They differ in kind, shape, colors, orientation and direction of the light.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from nerf_lightning.nerf.types.scene import Scene
 FAMILY_VERSION = 1
 """Part of the cache's key: raise it whenever one of the models changes."""
 REACH = 1.65
-"""No part of a model lies farther from the origin, in world units: cameras stand at 4, and near and far are 2 and 6."""
+"""Maximum distance of any part from the origin, in world units: cameras are at 4, and near and far are 2 and 6."""
 HALF = 1.2
-"""Nor beyond this along an axis."""
+"""Maximum coordinate along an axis."""
 
 
 @dataclass
 class BrickModelReader(BricksReader):
-    """Render a random model of bricks as the built-in scene is, with exact depth and normals.
+    """Render a random model of bricks like the built-in scene, with exact depth and normals.
 
     Args:
         variant: which model: 0 is the fire engine; every other number is a different vehicle or tower, with its own
@@ -45,11 +45,11 @@ class BrickModelReader(BricksReader):
     name: str = "brick_model"
 
     def model(self) -> Model:
-        """Return the model of the number."""
+        """Return the model of `variant`."""
         return model(self.variant) if self.variant else super().model()
 
     def model_key(self) -> dict[str, int]:
-        """Return what tells this model from others in the cache."""
+        """Return what distinguishes this model from others in the cache."""
         return {"variant": self.variant, "family": FAMILY_VERSION} if self.variant else {}
 
     def read(self) -> Scene:
@@ -73,14 +73,14 @@ class BrickModelReader(BricksReader):
 
 
 def model(variant: int) -> Model:
-    """Return the model of a number, 1 or more; the middle of its box is the origin."""
+    """Return the model of a number, 1 or more; its box is centered at the origin."""
     draws = Draws(variant)
     built = draws.pick("kind", (vehicle, tower))(draws)
     return Model(_placed(_turned(built, draws.number("turn", 0.0, 2 * np.pi))), _light(draws))
 
 
 def _turned(parts: Sequence[Part], angle: float) -> list[Part]:
-    """Turn parts around the vertical axis."""
+    """Rotate parts around the vertical axis."""
     cos, sin = float(np.cos(angle)), float(np.sin(angle))
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     turned = []
@@ -91,12 +91,12 @@ def _turned(parts: Sequence[Part], angle: float) -> list[Part]:
 
 
 def _placed(parts: Sequence[Part]) -> list[Part]:
-    """Bring the middle of the parts' box to the origin, and scale."""
+    """Center the parts' box at the origin, and scale."""
     corners = Solids.of(parts).corners().reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     reach = np.linalg.norm(corners - middle, axis=1).max()
-    # The fire engine's scale, or less for what would be larger than it.
+    # The fire engine's scale, or less for larger models.
     scale = min(SCALE, HALF / float(half.max()), REACH / float(reach))
     x, y, z = (-float(place) for place in middle)
     return [part.scaled(scale, (x, y, z)) for part in parts]

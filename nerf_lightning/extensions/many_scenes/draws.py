@@ -1,4 +1,4 @@
-"""What is drawn for a model of the family: each number a hash of the model's number and of what it is for."""
+"""Random numbers of a model of the family: each is a hash of the model's number and of its purpose."""
 
 import hashlib
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ COLORS: tuple[Triple, ...] = (
 
 
 def studs(xs: list[float], ys: list[float], z: float, material: Material) -> list[Part]:
-    """Return a grid of studs that stand on the height `z`."""
+    """Return a grid of studs at height `z`."""
     return [rod((x, y, z + 0.11), 0.3, 0.22, ALONG_Z, material) for x in xs for y in ys]
 
 
@@ -50,24 +50,24 @@ class Draws:
         self.variant = variant
 
     def number(self, what: str, low: float, high: float) -> float:
-        """Return a number, uniform between two."""
+        """Return a uniform number between `low` and `high`."""
         word = hashlib.sha256(f"bricks {self.variant} {what}".encode()).digest()[:4]
         return low + (high - low) * int.from_bytes(word, "big") / 2**32
 
     def whole(self, what: str, low: int, high: int) -> int:
-        """Return a whole number from `low` to `high`, both included."""
+        """Return an integer from `low` to `high`, inclusive."""
         return int(self.number(what, float(low), float(high + 1)))
 
     def pick(self, what: str, options: Sequence[Choice]) -> Choice:
-        """Return one of some options."""
+        """Return one of the options."""
         return options[self.whole(what, 0, len(options) - 1)]
 
     def chance(self, what: str, share: float) -> bool:
-        """Return true in a share of the models."""
+        """Return true in the share `share` of the models."""
         return self.number(what, 0.0, 1.0) < share
 
     def paints(self, count: int) -> list[Material]:
-        """Return materials of bricks, no two of one color."""
+        """Return materials of bricks with distinct colors."""
         left, paints = list(COLORS), []
         for number in range(count):
             color = left.pop(self.whole(f"paint.{number}", 0, len(left) - 1))

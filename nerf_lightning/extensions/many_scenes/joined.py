@@ -21,9 +21,9 @@ Kind = TypeVar("Kind")
 def joined(captures: Mapping[str, Scene], unseen: Collection[str], name: str) -> Scene:
     """Return captures as one scene, whose views are named CAPTURE/VIEW.
 
-    Each capture keeps its own frame and units: the frame of the user's is the scene's, and the box holds all contents.
-    Where some captures are unseen, nothing of them is trained on, and all that is held out is theirs; their training
-    views may be looked at while others of theirs are rendered, and are among the `sources`.
+    Each capture keeps its own frame and units: the user's frame is the scene's, and the box contains all contents. If
+    some captures are unseen, they are not trained on, and all held-out views are theirs; their training views serve to
+    render their other views, and are among the `sources`.
 
     Args:
         captures: by name, in order.
@@ -31,7 +31,7 @@ def joined(captures: Mapping[str, Scene], unseen: Collection[str], name: str) ->
         name: of the scene.
 
     Raises:
-        InputError: there are none, or captures that one model cannot take alike.
+        InputError: there are no captures, or one model cannot handle all of them.
     """
     if not captures:
         raise InputError(f"The scene {name} joins no captures. Give scene.variants, scene.root or scene.unseen.")
@@ -65,7 +65,7 @@ def joined(captures: Mapping[str, Scene], unseen: Collection[str], name: str) ->
 
 
 def _require_alike(captures: Mapping[str, Scene]) -> None:
-    """Refuse captures that differ in what a scene has once for all its views."""
+    """Refuse captures that differ in properties that a scene shares between all its views."""
     asked: dict[str, tuple[Callable[[Scene], str], str]] = {
         "space": (lambda scene: scene.space, "Read all of them in one (scene.space=bounded or contracted)"),
         "background": (lambda scene: scene.background, "Give one for all (scene.background=white)"),
@@ -144,6 +144,6 @@ def _splits(captures: Mapping[str, Scene], unseen: Collection[str]) -> dict[str,
 
 
 def _protocol(each: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """Return what is said of how the pixels were made; where captures differ, all that is said."""
+    """Return how the pixels were prepared; if captures differ, all of their values."""
     keys = dict.fromkeys(key for protocol in each for key in protocol)
     return {key: "; ".join(dict.fromkeys(protocol.get(key, "none") for protocol in each)) for key in keys}

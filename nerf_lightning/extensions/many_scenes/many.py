@@ -21,7 +21,7 @@ from nerf_lightning.nerf.types.scene import Scene
 MOST_VARIANTS = 10_000
 OF_BRICKS = ("resolution", "num_train", "num_val", "num_test", "gain", "gamma", "background", "cache_dir")
 OF_FOLDERS = ("downscale", "hold_every", "space", "background", "cache_dir", "allow_outside")
-"""Settings that are handed to the readers of bricks models, and of folders."""
+"""Settings that are passed to the readers of bricks models, and of folders."""
 
 
 @dataclass
@@ -70,7 +70,7 @@ class ManyReader(Reader):
         """Return all captures as one scene.
 
         Raises:
-            InputError: no captures, captures that cannot be joined, or anything wrong with one of them.
+            InputError: there are no captures, they cannot be joined, or anything is wrong with one of them.
         """
         nothing = self.root is None and self.variants is None and self.unseen is None
         if nothing or (self.root is not None and self.variants is not None):

@@ -1,4 +1,4 @@
-"""Random towers: floors of windows on each other, a roof, perhaps a wing and a plate to stand on. In studs, z up."""
+"""Random towers: stacked floors with windows, a roof, possibly a wing and a base plate. In studs, z up."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from nerf_lightning.extensions.many_scenes.draws import Draws, studs
 
 
 def tower(draws: Draws) -> list[Part]:
-    """Return a tower that stands on the ground."""
+    """Return a tower on the ground."""
     wide, deep = draws.number("wide", 2.0, 4.2), draws.number("deep", 1.8, 3.6)
     round_, paints = draws.chance("round", 0.35), draws.paints(4)
     parts, low = _ground(draws, wide, deep, paints[3])
@@ -36,7 +36,7 @@ def tower(draws: Draws) -> list[Part]:
 
 
 def _ground(draws: Draws, wide: float, deep: float, paint: Material) -> tuple[list[Part], float]:
-    """Return a plate with studs or trees, and a wing, where there are any; and the height on which the tower stands."""
+    """Return a plate with studs or trees, and a wing, if any, and the height of the tower's base."""
     parts: list[Part] = []
     if draws.chance("plate", 0.7):
         x, y = wide + 1.4, deep + 1.4

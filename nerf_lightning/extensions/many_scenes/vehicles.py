@@ -22,7 +22,7 @@ from nerf_lightning.extensions.many_scenes.draws import Draws, studs
 
 
 def vehicle(draws: Draws) -> list[Part]:
-    """Return a vehicle, its front toward x."""
+    """Return a vehicle that faces x."""
     half, wide = draws.number("length", 3.2, 6.2), draws.number("width", 1.8, 2.9)
     radius = draws.number("wheels", 0.75, 1.35)
     floor = radius + draws.number("clearance", 0.5, 1.0)

@@ -1,4 +1,4 @@
-"""nerf_lightning as a method of NerfBaselines, written with what `import nerf_lightning` offers."""
+"""nerf_lightning as a method of NerfBaselines, using only the public API of `import nerf_lightning`."""
 
 import shutil
 from pathlib import Path
@@ -22,7 +22,7 @@ INFO = {
 
 
 def cameras_of(cameras: Any) -> nl.Cameras:
-    """Return cameras of NerfBaselines, whose coefficients are k1 k2 p1 p2 k3 k4, as ours."""
+    """Convert cameras of NerfBaselines, whose coefficients are k1 k2 p1 p2 k3 k4, to ours."""
     fisheye = cameras.camera_models == FISHEYE
     if fisheye.any() and not fisheye.all():
         raise nl.InputError("The data set mixes fisheyes with other lenses, and a scene has lenses of one kind.")
@@ -34,7 +34,7 @@ def cameras_of(cameras: Any) -> nl.Cameras:
 
 
 def scene_of(dataset: Any) -> nl.Scene:
-    """Return a data set of NerfBaselines as a scene; all of its views are learned from."""
+    """Return a dataset of NerfBaselines as a scene; all of its views are for training."""
     cameras, masks, behind = dataset["cameras"], dataset.get("masks"), dataset["metadata"].get("background_color")
     parts = [np.s_[: int(height), : int(width)] for width, height in cameras.image_sizes]
     images = [convert_image_dtype(image[part], np.uint8) for image, part in zip(dataset["images"], parts, strict=True)]

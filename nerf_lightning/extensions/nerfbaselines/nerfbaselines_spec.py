@@ -1,4 +1,4 @@
-"""What NerfBaselines reads by our entry point each time it starts: no torch is loaded here."""
+"""The entry point that NerfBaselines reads each time it starts: torch is not imported here."""
 
 from nerfbaselines import register
 

@@ -1,4 +1,4 @@
-"""Bundler's `bundle.out` (also of RealityScan and Metashape) beside a list of the pictures."""
+"""Bundler's `bundle.out` (also of RealityScan and Metashape) next to a list of the pictures."""
 
 import re
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ FOCAL = re.compile(r"[-+.\deE]+")
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read the cameras with a focal length; others have no pose. The principal point is the picture's middle.
+    """Read the cameras with a focal length; others have no pose. The principal point is the picture's center.
 
     A pose is world to camera with axes right, up, back.
     """
@@ -63,7 +63,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _name(line: str) -> str:
-    """Return the name of a picture in a line of a list, without a 0 and a focal length behind it."""
+    """Return the name of a picture in a line of a list, without a following 0 and focal length."""
     words = line.rsplit(maxsplit=2)
     if len(words) == 3 and words[1] == "0" and FOCAL.fullmatch(words[2]):
         return words[0]
@@ -71,7 +71,7 @@ def _name(line: str) -> str:
 
 
 def _numbers(lines: Iterator[str], rows: int, count: int, path: Path) -> list[float]:
-    """Return so many numbers of the next lines."""
+    """Return `count` numbers from the next `rows` lines."""
     words = " ".join(islice(lines, rows)).split()
     try:
         if len(words) == count:

@@ -1,4 +1,4 @@
-"""Meshroom's cameras (AliceVision): `cameras.sfm` or `sfm.json`, with views, intrinsics and poses by their numbers."""
+"""Meshroom's cameras (AliceVision): `cameras.sfm` or `sfm.json`, with views, intrinsics and poses by ID."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,15 +36,15 @@ LENSES: dict[str, tuple[LensModel, tuple[int, ...]]] = {
     "brown": ("radial_tangential", (0, 1, 2, 4, 5)),
     "fisheye4": ("fisheye", (0, 1, 2, 3)),
 }
-"""By the distortion's type: the kind of lens, and which of k1, k2, k3, k4, p1, p2 its numbers are."""
+"""By type of distortion: the kind of lens, and which of k1, k2, k3, k4, p1, p2 its parameters are."""
 OLD_NAMES = {"pinhole": "none", "radial1": "radialk1", "radial3": "radialk3"}
 """Until version 1.2.6 the intrinsics' type named the distortion, too."""
 DEFAULT_SENSOR = 36.0
-"""Width in millimeters where none is said."""
+"""Default width in millimeters."""
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read the views that have a pose. A rotation is world to camera, by columns; cameras of a rig are composed."""
+    """Read the views that have a pose. A rotation is world to camera, column-major; poses of rigs are composed."""
     content = read_json(path)
     views = entries(content, "views", f"{path} of Meshroom (AliceVision)")
     file = _File.read(content, str(path))
@@ -63,7 +63,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 
 @dataclass(frozen=True)
 class _File:
-    """What the views of a file refer to by numbers."""
+    """What the views of a file refer to by ID."""
 
     version: tuple[int, ...]
     intrinsics: dict[str, dict[str, Any]]
@@ -130,7 +130,7 @@ class _File:
         )
 
     def _focal(self, said: dict[str, Any], width: float, where: str) -> tuple[float, float]:
-        """Return the focal lengths in pixels, which the file's version has in pixels or in millimeters."""
+        """Return the focal lengths in pixels; depending on its version, the file has pixels or millimeters."""
         if self.version < (1, 2, 0):
             return (number(said, "pxFocalLength", where),) * 2
         if self.version < (1, 2, 2):
@@ -144,7 +144,7 @@ class _File:
 
 
 def _opencv_pose(transform: dict[str, Any], where: str) -> Pose:
-    """Return a camera to world with axes right, down, ahead; a world to camera's columns are its rows."""
+    """Return camera to world with axes right, down, forward; its rows are the columns of world to camera."""
     rotation = torch.tensor(numbers(transform.get("rotation"), 9, f"{where}: rotation"), dtype=torch.float64)
     center = torch.tensor(numbers(transform.get("center"), 3, f"{where}: center"), dtype=torch.float64)
     return pose_from_matrix(torch.cat([rotation.reshape(3, 3), center[:, None]], dim=1), where)

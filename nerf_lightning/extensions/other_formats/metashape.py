@@ -1,4 +1,4 @@
-"""Agisoft Metashape's cameras (File > Export > Export Cameras, Agisoft XML) beside the photographs."""
+"""Agisoft Metashape's cameras (File > Export > Export Cameras, Agisoft XML) next to the photographs."""
 
 import logging
 import math
@@ -33,7 +33,7 @@ SIGNATURE = ("*.xml", r"\A(?=[\s\S]*?<document)[\s\S]*?<chunk")
 LENSES: dict[str, LensModel] = {"frame": "radial_tangential", "fisheye": "fisheye", "spherical": "equirectangular"}
 """By a sensor's type."""
 OFF = ("0", "false")
-"""What `enabled` is of cameras that are switched off."""
+"""Values of `enabled` for disabled cameras."""
 OF_ITS_OWN = ("b2", "p3", "p4")
 """Skew, and the higher tangential terms."""
 CURE = "Export the cameras again (Agisoft XML)."
@@ -53,7 +53,7 @@ class Sensor:
 
 
 class Aligned(NamedTuple):
-    """A camera, and the one whose transform it has: itself, or the master of its rig."""
+    """A camera, and the one whose transform it uses: itself, or the master of its rig."""
 
     label: str
     camera: Element
@@ -61,16 +61,16 @@ class Aligned(NamedTuple):
 
     @property
     def component(self) -> str:
-        """Return the number of what was aligned together."""
+        """Return the ID of the component that was aligned together."""
         return self.posed.get("component_id", "")
 
 
 @dataclass
 class MetashapeReader(CaptureReader):
-    """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
+    """Read the cameras of the first chunk that has any, including those in groups; unaligned ones have no pose.
 
     Of several components, whose frames differ, the largest is read. Slaves of a rig have their master's pose times
-    their sensor's place in the rig.
+    their sensor's pose in the rig.
 
     Args:
         file: the XML file below root; null: the only one there.
@@ -83,7 +83,7 @@ class MetashapeReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         return file_with(folder, SIGNATURE)
 
     def capture(self) -> Capture:
@@ -121,7 +121,7 @@ class MetashapeReader(CaptureReader):
         return of_one_lens(Capture(tuple(views), path, undo=undo, left_out=left_out), lenses)
 
     def _path(self, root: Path) -> Path:
-        """Return the file that the user has named, or the only one."""
+        """Return the file that the user named, or the only one."""
         named = Path(self.root).expanduser()
         if self.file is not None or os.path.isfile(named):
             return named if self.file is None else root / self.file
@@ -169,7 +169,7 @@ def _sensor(sensor: Element | None, number: str, path: Path) -> Sensor:
         return _number(adjusted.findtext(key, "0"), path)
 
     f, b1 = number_of("f"), number_of("b1")
-    # Metashape's P1 and P2 are OpenCV's p2 and p1; its center counts from the middle of the picture.
+    # Metashape's P1 and P2 are OpenCV's p2 and p1; its principal point is relative to the center of the picture.
     k1, k2, k3, k4, p2, p1 = (number_of(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     center = (width / 2 + number_of("cx"), height / 2 + number_of("cy"))
     return Sensor(LENSES[kind], (width, height), (f + b1, f), center, (k1, k2, k3, k4, p1, p2))
@@ -188,7 +188,7 @@ def _view(c2w: Float[Tensor, "3 4"], label: str, sensor: Sensor, picture: Path) 
 
 
 def _named(chunk: Element) -> list[tuple[str, Element]]:
-    """Return the cameras with their labels, in order; those that are alike have their group's before."""
+    """Return the cameras with their labels, in order; equal labels are prefixed with their group's."""
     found = list[tuple[str, str, Element]]()
     for each in chunk.iterfind("cameras/*"):
         group = each.get("label") or "" if each.tag == "group" else ""
@@ -198,7 +198,7 @@ def _named(chunk: Element) -> list[tuple[str, Element]]:
 
 
 def _aligned(cameras: list[tuple[str, Element]]) -> Iterator[Aligned]:
-    """Return the cameras that have a transform, or whose master has one."""
+    """Yield the cameras that have a transform, or whose master has one."""
     by_number = {camera.get("id"): camera for _, camera in cameras}
     for label, camera in cameras:
         posed = camera if camera.findtext("transform") else by_number.get(camera.get("master_id"))
@@ -207,7 +207,7 @@ def _aligned(cameras: list[tuple[str, Element]]) -> Iterator[Aligned]:
 
 
 def _largest(aligned: list[Aligned], chunk: Element, path: Path) -> tuple[Element, list[Aligned]]:
-    """Return the component with most cameras, and these; the chunk stands for one without a transform."""
+    """Return the component with most cameras, and these; the chunk replaces one without a transform."""
     counts = Counter(each.component for each in aligned)
     number = max(counts, key=counts.__getitem__, default="")
     others = [each.label for each in aligned if each.component != number]
@@ -223,7 +223,7 @@ def _largest(aligned: list[Aligned], chunk: Element, path: Path) -> tuple[Elemen
 
 
 def _place_in_rig(sensor: Element, where: str, path: Path) -> Float[Tensor, "4 4"]:
-    """Return a slave's camera to its master's, axes right, down, ahead."""
+    """Return the transform from a slave's camera to its master's, axes right, down, forward."""
     rotation, location = (sensor.findtext(key, "").split() for key in ("rotation", "location"))
     if (len(rotation), len(location)) != (9, 3):
         raise InputError(f"{where} has no rotation and location in its rig, so it has no pose. {CURE}")
@@ -242,7 +242,7 @@ def _matrix_of(numbers: list[float], where: str) -> Float[Tensor, "4 4"]:
 
 
 def _to_world(part: Element, path: Path) -> Float[Tensor, "4 4"]:
-    """Return what takes the frame of a component or a chunk to the world's, where it is referenced."""
+    """Return the transform from the frame of a component or a chunk to the world, if it is referenced."""
     matrix = torch.eye(4, dtype=torch.float64)
     transform = part.find("transform")
     if transform is None:

@@ -1,4 +1,4 @@
-"""Nerfies' and HyperNeRF's captures (also DyCheck's): `dataset.json`, `camera/` with a json each, `rgb/1x`, ..."""
+"""Captures of Nerfies and HyperNeRF (also DyCheck): `dataset.json`, `camera/` with a JSON file each, `rgb/1x`, ..."""
 
 import logging
 from pathlib import Path
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read the pictures of the largest size. An orientation is world to camera, by rows, beside the position."""
+    """Read the pictures of the largest size. An orientation is world to camera, row-major, with the position."""
     root = path.parent
     content = read_json(path)
     ids = [str(each) for each in entries(content, "ids", f"{path} of Nerfies or HyperNeRF")]
@@ -91,7 +91,7 @@ def _say_that_it_moves(root: Path, ids: list[str]) -> None:
 
 
 def _bounds(root: Path, views: int) -> Float[Tensor, "views 2"] | None:
-    """Return the nearest and farthest depth of `scene.json`, which are of positions times its scale."""
+    """Return the nearest and farthest depth in `scene.json`, which are in units after its scale."""
     said = read_json_object(root / "scene.json")
     if not {"scale", "near", "far"} <= said.keys():
         return None

@@ -1,4 +1,4 @@
-"""Captures of NeuS and IDR (DTU, BlendedMVS): `cameras_sphere.npz` beside `image/` and `mask/`."""
+"""Captures of NeuS and IDR (DTU, BlendedMVS): `cameras_sphere.npz` next to `image/` and `mask/`."""
 
 import logging
 import re
@@ -36,9 +36,9 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class NeusReader(CaptureReader):
-    """Read projection matrices `world_mat_N`; `scale_mat_N` takes the unit cube to the box that holds the content.
+    """Read projection matrices `world_mat_N`; `scale_mat_N` maps the unit cube to the content's bounding box.
 
-    The photographs belong to the matrices in order of their names. `scene.masks=mask` uses the masks.
+    The photographs, sorted by name, correspond to the matrices. `scene.masks=mask` uses the masks.
 
     Args:
         images: the folder of the photographs below root; null: image, images or rgb.
@@ -49,11 +49,11 @@ class NeusReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         return next((name for name in FILES if (folder / name).is_file()), None)
 
     def capture(self) -> Capture:
-        """Return the photographs in order of their names."""
+        """Return the photographs, sorted by name."""
         root = self.folder()
         path = root / (self.found_in(root) or FILES[0])
         world, scale = _matrices(path)
@@ -79,7 +79,7 @@ class NeusReader(CaptureReader):
 
 
 def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
-    """Return the world and the scale matrices by their numbers."""
+    """Return the world and the scale matrices by number."""
     with open_npz(path, CURE) as archive:
         found: dict[str, dict[int, ndarray]] = {"world": {}, "scale": {}}
         wanted = [match for key in archive if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
@@ -120,13 +120,13 @@ def _decomposed(
     k, rotation = np.flipud(np.fliplr(r.T)), np.flipud(q.T)
     signs = np.sign(np.diag(k))
     k, rotation = k * signs, signs[:, None] * rotation
-    if np.linalg.det(rotation) < 0:  # P and -P are one projection
+    if np.linalg.det(rotation) < 0:  # P and -P are the same projection
         rotation = -rotation
     return k / k[2, 2], rotation, -np.linalg.solve(projection[:, :3], projection[:, 3])
 
 
 def _box(scale: dict[int, Float[ndarray, "4 4"]]) -> Float[Tensor, "2 3"] | None:
-    """Return the corners of the box around the unit ball that holds the content; they are alike in all views."""
+    """Return the corners of the box around the unit ball that contains the content; they are the same in all views."""
     if not scale:
         return None
     first = torch.from_numpy(scale[min(scale)])

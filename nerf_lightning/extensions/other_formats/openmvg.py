@@ -1,4 +1,4 @@
-"""openMVG's `sfm_data.json`: views, intrinsics and poses by their numbers, as cereal writes them."""
+"""openMVG's `sfm_data.json`: views, intrinsics and poses by ID, as cereal writes them."""
 
 from pathlib import Path
 from typing import Any
@@ -31,13 +31,13 @@ LENSES: dict[str, tuple[LensModel, str, tuple[int, ...]]] = {
     "pinhole_brown_t2": ("radial_tangential", "disto_t2", (0, 1, 2, 4, 5)),
     "fisheye": ("fisheye", "fisheye", (0, 1, 2, 3)),
 }
-"""By the type's name: the kind of lens, the key of its numbers, and which of k1, k2, k3, k4, p1, p2 they are."""
+"""By name of the type: the kind of lens, the key of its parameters, and which of k1, k2, k3, k4, p1, p2 they are."""
 IS_NEW = 1 << 31
-"""What cereal adds to the number of a type where it is named for the first time."""
+"""Flag that cereal adds to a type's ID at its first occurrence, with its name."""
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read the views that have a pose. A rotation is world to camera, by rows, beside the camera's center."""
+    """Read the views that have a pose. A rotation is world to camera, in row-major order, with the camera's center."""
     content = read_json(path)
     where = f"{path} of openMVG"
     poses, cameras = _by_key(content, "extrinsics", where), _intrinsics(content, where)
@@ -71,18 +71,18 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 
 
 def _by_key(content: object, name: str, where: str) -> dict[Any, Any]:
-    """Return a map as cereal writes it: a list of key and value."""
+    """Return a map from cereal's list of keys and values."""
     items = [item for item in entries(content, name, where) if isinstance(item, dict)]
     return {str(item["key"]): item.get("value") for item in items if isinstance(item.get("key"), (int, str))}
 
 
 def _data(value: object) -> dict[str, Any]:
-    """Return what a pointer of cereal's leads to."""
+    """Return the target of a cereal pointer."""
     return mapping(mapping(mapping(value).get("ptr_wrapper")).get("data"))
 
 
 def _intrinsics(content: object, where: str) -> dict[Any, tuple[dict[str, Any], str]]:
-    """Return the intrinsics with their types; a type is named where it is used first, and later has its number."""
+    """Return the intrinsics with their types; a type is named at its first occurrence, and later has only its ID."""
     names, found = dict[int, str](), {}
     for key, value in _by_key(content, "intrinsics", where).items():
         kind, name = mapping(value).get("polymorphic_id"), mapping(value).get("polymorphic_name")
@@ -95,7 +95,7 @@ def _intrinsics(content: object, where: str) -> dict[Any, tuple[dict[str, Any], 
 
 
 def _camera(said: dict[str, Any], kind: str, where: str) -> Intrinsics:
-    base = mapping(said.get("value0")) or said  # of some versions
+    base = mapping(said.get("value0")) or said  # in some versions
     width, height = number(base, "width", where), number(base, "height", where)
     if kind == "spherical":
         return panorama((width, height))

@@ -35,7 +35,7 @@ PLACES = {
     "undistorted/reconstruction.json": "undistorted/images",
     "opensfm/undistorted/reconstruction.json": "opensfm/undistorted/images",
 }
-"""Reconstructions, and the folder of the photographs that each is about."""
+"""Reconstructions, and the folder of photographs of each."""
 LENSES: dict[str, tuple[LensModel, tuple[str, ...]]] = {
     "perspective": ("radial_tangential", ("k1", "k2")),
     "simple_radial": ("radial_tangential", ("k1",)),
@@ -51,13 +51,13 @@ log = logging.getLogger(__name__)
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read the largest reconstruction. Its frame is local: east, north, up in meters where photographs have GPS.
+    """Read the largest reconstruction. Its frame is local: east, north, up in meters if photographs have GPS.
 
-    A shot's rotation is an axis times an angle, world to camera. Lengths in a picture are in units of its longer side.
+    A shot's rotation is axis-angle, world to camera. Lengths in a picture are in units of its longer side.
     """
     root = reader.folder()
     folders = {root / place: root / pictures for place, pictures in PLACES.items() if (root / place).is_file()}
-    if not os.path.isfile(Path(reader.root).expanduser()):  # the first whose photographs are there
+    if not os.path.isfile(Path(reader.root).expanduser()):  # the first whose photographs exist
         path = next((place for place, pictures in folders.items() if pictures_below(pictures)), path)
     pictures = folders.get(path, root)
     folder = pictures if pictures_below(pictures) else None
@@ -86,7 +86,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 
 
 def _largest(path: Path) -> dict[str, Any]:
-    """Return the reconstruction with most shots, and say that there are others."""
+    """Return the reconstruction with most shots, and log that there are others."""
     content = read_json(path)
     parts = [part for part in content if isinstance(part, dict)] if isinstance(content, list) else []
     counts = [len(mapping(part.get("shots"))) for part in parts]

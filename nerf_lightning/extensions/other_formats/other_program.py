@@ -1,4 +1,4 @@
-"""Captures of other programs with a camera for each picture: each is a row of `FORMATS`."""
+"""Captures of other programs with a camera per picture: each format is a row of `FORMATS`."""
 
 import logging
 import os
@@ -33,14 +33,14 @@ FORMATS: tuple[Format, ...] = (
     *trajectories.FORMATS,
     bundler.FORMAT,
 )
-"""Where a folder has the files of several, the first says more."""
+"""If a folder has the files of several, the first one says more."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class OtherProgramReader(PosedReader):
-    """Read one of `FORMATS`, which its files tell."""
+    """Read one of `FORMATS`, determined by its files."""
 
     named_by = (".json", ".sfm", ".out", ".log")
 
@@ -48,7 +48,7 @@ class OtherProgramReader(PosedReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which a format is known, where a folder has it, or is that file itself."""
+        """Return the file by which a format is recognized, if a folder has it, or is that file itself."""
         found = _known(folder)
         return found[1][0] if found else None
 
@@ -56,7 +56,7 @@ class OtherProgramReader(PosedReader):
         """Return all pictures, in the file's order.
 
         Raises:
-            InputError: no known format, or anything wrong with the files.
+            InputError: the format is unknown, or anything is wrong with the files.
         """
         named, folder = Path(self.root).expanduser(), self.folder()
         found = _known(named if os.path.isfile(named) else folder)
@@ -72,7 +72,7 @@ class OtherProgramReader(PosedReader):
 
 
 def _known(place: Path) -> tuple[Format, list[str]] | None:
-    """Return the format of a file, or of a folder, and the files that have its signature, below the folder."""
+    """Return the format of a file or a folder, and the files with its signature, below the folder."""
     for form in FORMATS:
         for signature in form.signatures:
             if place.is_file() and fits(place, signature):

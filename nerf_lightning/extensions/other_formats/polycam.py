@@ -1,4 +1,4 @@
-"""Polycam's raw data: `keyframes/` with a json of pose and intrinsics for each photograph, and LiDAR's depth maps."""
+"""Polycam's raw data: `keyframes/` with a JSON file of pose and intrinsics per photograph, and LiDAR depth maps."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-"""Of poses and photographs: those that the app has refined, then those that it recorded."""
+"""Of poses and photographs: those refined by the app, then those as recorded."""
 
 
 @dataclass
@@ -32,12 +32,12 @@ class PolycamReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the folder by which this format is known, where a folder has it."""
+        """Return the folder by which this format is recognized, if a folder has it."""
         found = _folders_in(folder)
         return None if found is None else found[0].relative_to(folder).as_posix()
 
     def capture(self) -> Capture:
-        """Return the photographs in order of their names."""
+        """Return the photographs, sorted by name."""
         keyframes = self.folder() / "keyframes"
         cameras, pictures = _folders_in(self.folder()) or (keyframes / FOLDERS[-1][0], keyframes / FOLDERS[-1][1])
         files = pictures_by_stem(pictures)
@@ -56,7 +56,7 @@ class PolycamReader(CaptureReader):
 
 
 def _folders_in(root: Path) -> tuple[Path, Path] | None:
-    """Return the folders of poses and of photographs, those first that have both; None where there are no poses."""
+    """Return the folders of poses and of photographs, preferring a pair with both; None if there are no poses."""
     found = [(root / "keyframes" / poses, root / "keyframes" / pictures) for poses, pictures in FOLDERS]
     found = [(poses, pictures) for poses, pictures in found if next(poses.glob("[!.]*.json"), None)]
     whole = [(poses, pictures) for poses, pictures in found if next(iter(pictures_below(pictures)), None)]
@@ -70,7 +70,7 @@ def _view(path: Path, picture: Path, depth: Path) -> View:
     matrix = [[number_of(said, f"t_{row}{column}", str(path)) for column in range(4)] for row in range(3)]
     fx, fy, cx, cy = (number_of(said, key, str(path)) for key in ("fx", "fy", "cx", "cy"))
     header = read_header(picture)
-    stored = dict(zip(("width", "height"), map(float, header.size), strict=True))  # those refined lack them
+    stored = dict(zip(("width", "height"), map(float, header.size), strict=True))  # refined ones lack them
     width, height = (number_of(said, key, str(path), default) for key, default in stored.items())
     return View(
         name=picture.name,

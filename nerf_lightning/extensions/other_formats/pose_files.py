@@ -1,4 +1,4 @@
-"""Captures with a file for each pose: ScanNet, 7-Scenes, 12-Scenes, BundleFusion, MVSNet, 3D Scanner App.
+"""Captures with one file per pose: ScanNet, 7-Scenes, 12-Scenes, BundleFusion, MVSNet, 3D Scanner App.
 
 Each has a function that reads such a file, and a row in `LAYOUTS`.
 """
@@ -33,38 +33,38 @@ from nerf_lightning.messages.errors import InputError
 CURE = "Copy it again."
 MVSNET = re.compile(r"\s*extrinsic\s+((?:\S+\s+){16})intrinsic\s+((?:\S+\s+){8}\S+)")
 INFO = r"m_%s\s*=\s*([-+.\deE \t]+)"
-"""What info.txt has of the color camera."""
+"""Matches values of the color camera in info.txt."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a program has its poses and pictures, as patterns below a folder."""
+    """Where a program stores its poses and pictures, as patterns below a folder."""
 
     program: str
     signature: Signature
     poses: str
-    """Of the files of poses; * is what they are called."""
+    """Of the files of poses; * is their name."""
     pictures: tuple[str, ...]
-    """Of a picture without ending, where {} is what its pose is called; the first whose folder has pictures."""
+    """Of a picture without extension, where {} is its pose's name; the first one whose folder has pictures is used."""
     camera: Callable[[PosedReader, Path, Size], tuple[Pose, Intrinsics]]
     """Reads the file of a pose, whose picture has (width, height) pixels."""
     depth: str | None = None
-    """Of the depth maps beside the poses, in millimeters."""
+    """Of the depth maps that belong to the poses, in millimeters."""
     more_poses: bool = False
-    """Whether there are poses of which no picture was kept."""
+    """Whether there are poses whose picture was not kept."""
 
 
 def _scannet(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
-    """Read a camera to world; the color camera's matrix is that of all."""
+    """Read camera to world; all share the color camera's matrix."""
     matrix = first_numbers(path.parent.parent / "intrinsic" / "intrinsic_color.txt")
     (fx, fy, cx, cy), size = intrinsics_of(matrix, (int(size[0]), int(size[1])))
     return from_opencv(first_numbers(path)[:16], str(path)), Intrinsics((fx, fy), (cx, cy), size)
 
 
 def _seven_scenes(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
-    """Read a camera to world; 12-Scenes and BundleFusion have the intrinsics in info.txt."""
+    """Read camera to world; 12-Scenes and BundleFusion have the intrinsics in info.txt."""
     pose = from_opencv(first_numbers(path)[:16], str(path))
     info = next((file for folder in path.parents[:2] if (file := folder / "info.txt").is_file()), None)
     if info is None:
@@ -78,7 +78,7 @@ def _seven_scenes(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, In
 
 
 def _mvsnet(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
-    """Read a world to camera, and the camera's matrix."""
+    """Read world to camera, and the camera's matrix."""
     match = MVSNET.match(read_text(path, "text", CURE))
     if match is None:
         raise InputError(f"{path} does not hold the matrices extrinsic and intrinsic, as MVSNet has them. {CURE}")
@@ -87,7 +87,7 @@ def _mvsnet(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsi
 
 
 def _scanner_app(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, Intrinsics]:
-    """Read ARKit's camera to world, with axes right, up, back as ours, and the camera's matrix."""
+    """Read ARKit's camera to world, with axes right, up, back like ours, and the camera's matrix."""
     said = mapping(read_json(path))
     pose = numbers(said.get("cameraPoseARFrame"), 16, f"{path}: cameraPoseARFrame")
     matrix = numbers(said.get("intrinsics"), 9, f"{path}: intrinsics")
@@ -118,7 +118,7 @@ LAYOUTS = (
 
 
 def _read(layout: Layout, reader: PosedReader, first: Path) -> Capture:
-    """Return the photographs in order of their poses' names."""
+    """Return the photographs, sorted by the names of their poses."""
     root = reader.folder()
     if not layout.depth:
         log.info("%s: depth maps are not read", root)

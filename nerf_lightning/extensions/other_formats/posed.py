@@ -1,4 +1,4 @@
-"""What readers of cameras beside pictures share: each names its files and gives a camera for each picture."""
+"""The base of readers with a camera per picture: each names its files and returns a camera for each picture."""
 
 import logging
 import math
@@ -52,12 +52,12 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Posed:
-    """One picture with its camera, as a format has them."""
+    """One picture with its camera, as in the format."""
 
     name: str
     """Of the picture."""
     where: str
-    """In which file, for messages."""
+    """Its place in a file, for messages."""
     camera: Callable[[Size], tuple[Pose, Intrinsics]]
     """Returns the camera to world (right, up, back, center) of a picture of (width, height) pixels, and its intrinsics;
     `InputError` says why there are none."""
@@ -70,11 +70,11 @@ FOLDERS = (*(name for name in PICTURE_FOLDERS if name), "color", "frames", "resu
 
 @dataclass
 class PosedReader(CaptureReader):
-    """Read pictures with a camera each, as a format lists them.
+    """Read pictures with one camera each, as listed by a format.
 
     Args:
         images: the folder of the pictures below root; null: the format's own.
-        intrinsics: fx, fy, cx, cy in pixels of the pictures, of formats that have none.
+        intrinsics: fx, fy, cx, cy in pixels of the pictures, for formats without intrinsics.
     """
 
     images: str | None = None
@@ -89,14 +89,14 @@ class PosedReader(CaptureReader):
         root: Path | None = None,
         **more: Any,
     ) -> Capture:
-        """Return the capture of all pictures that are there and have a camera.
+        """Return the capture of all existing pictures with a camera.
 
         Args:
             source: the file that lists them.
-            items: what it lists, by where that stands in it.
-            posed: returns the picture of an item, which stands at a place (for messages).
-            folder: what names are relative to; None: where photographs usually lie.
-            root: the folder below which pictures are looked for; None: the one that the user named.
+            items: its entries, by their place in it.
+            posed: returns the picture of an entry; takes the entry and its place (for messages).
+            folder: what names are relative to; None: the usual folder of photographs.
+            root: the folder below which pictures are searched for; None: the one that the user named.
             more: further values of `Capture`.
         """
         require_within("views", len(items), source, "views")
@@ -139,7 +139,7 @@ class PosedReader(CaptureReader):
         return of_one_lens(Capture(tuple(views), source, left_out=left_out, **more), kinds)
 
     def given(self, program: str, size: Size = (1.0, 1.0)) -> Intrinsics:
-        """Return the intrinsics that the user has given, for a picture of (width, height) pixels."""
+        """Return the intrinsics given by the user, for a picture of (width, height) pixels."""
         if self.intrinsics is None or len(self.intrinsics) != 4:
             raise InputError(
                 f"{self.root}: {program} has poses without focal lengths. Give fx, fy, cx and cy in pixels of the "
@@ -161,26 +161,26 @@ class PosedReader(CaptureReader):
 
 @dataclass(frozen=True)
 class Format:
-    """How the captures of a program are known and read."""
+    """How to recognize and read captures of a program."""
 
     program: str
     signatures: tuple[Signature, ...]
     """Of the file that lists the cameras, the likeliest first."""
     read: Callable[[PosedReader, Path], Capture]
-    """Returns what such a file lists, in its order."""
+    """Returns the content of such a file, in its order."""
     suits: Callable[[Path], bool] = Path.exists
     """Whether a folder with such a file is such a capture."""
     one_each: bool = False
-    """Whether such a file is of one picture."""
+    """Whether such a file belongs to one picture."""
 
 
 def from_opencv(matrix: object, where: str) -> Pose:
-    """Return a camera to world, given with axes right, down, ahead, with axes right, up, back."""
+    """Convert camera to world from axes right, down, forward to axes right, up, back."""
     return flip_yz(pose_from_matrix(matrix, where))
 
 
 def from_world_to_camera(matrix: object, where: str) -> Pose:
-    """Return the camera to world (right, up, back) of a world to camera with axes right, down, ahead."""
+    """Convert world to camera with axes right, down, forward to camera to world (right, up, back)."""
     w2c = pose_from_matrix(matrix, where)
     try:
         inverse = torch.linalg.inv(w2c[:, :3])
@@ -190,13 +190,13 @@ def from_world_to_camera(matrix: object, where: str) -> Pose:
 
 
 def from_rotation_and_center(rotation: list[float], center: list[float], where: str) -> Pose:
-    """Return the camera to world (right, up, back) of a world to camera rotation, by rows, and the camera's center."""
+    """Return camera to world (right, up, back) from a row-major world-to-camera rotation and the camera's center."""
     matrix = torch.tensor(rotation, dtype=torch.float64).reshape(3, 3).mT
     return from_opencv(torch.cat([matrix, torch.tensor(center, dtype=torch.float64)[:, None]], dim=1), where)
 
 
 def numbers(value: object, count: int, where: str) -> list[float]:
-    """Return the numbers of nested lists, in order, which json may also hold as text.
+    """Return the numbers of nested lists, in order; JSON may also contain them as text.
 
     >>> numbers([[1, 0], ["0.5", 2]], 4, "a.json: matrix")
     [1.0, 0.0, 0.5, 2.0]
@@ -215,13 +215,13 @@ def numbers(value: object, count: int, where: str) -> list[float]:
 
 
 def number(content: dict[str, Any], key: str, where: str, default: object = None) -> float:
-    """Return a number, which json may hold as text."""
+    """Return a number, which JSON may contain as text."""
     (value,) = numbers(content.get(key, default), 1, f"{where}: {key}")
     return value
 
 
 def entries(content: object, key: str, where: str) -> list[Any]:
-    """Return a list that a json object has."""
+    """Return a list in a JSON object."""
     found = content.get(key) if isinstance(content, dict) else None
     if not isinstance(found, list):
         raise InputError(f"{where} must have a list {key}. {CURE}")
@@ -229,7 +229,7 @@ def entries(content: object, key: str, where: str) -> list[Any]:
 
 
 def numbered(key: str, items: list[Item]) -> dict[str, Item]:
-    """Return what a list of a file holds, by where that stands in it.
+    """Return the items of a list in a file, by their place in it.
 
     >>> numbered("frames", ["a", "b"])
     {'frames[0]': 'a', 'frames[1]': 'b'}
@@ -238,7 +238,7 @@ def numbered(key: str, items: list[Item]) -> dict[str, Item]:
 
 
 def sparse_points(found: Collection[object], path: Path) -> Float[Tensor, "points 3"]:
-    """Return points of three numbers each; none, which is said, where one is broken."""
+    """Return points of three numbers each; if one is broken, none, which is logged."""
     require_within("points", len(found), path, "points")
     try:
         rows = [numbers(point, 3, f"{path}: a point") for point in found]
@@ -249,7 +249,7 @@ def sparse_points(found: Collection[object], path: Path) -> Float[Tensor, "point
 
 
 def similarity(matrix: object, where: str) -> Float[Tensor, "4 4"]:
-    """Return a matrix that rotates, scales alike along all axes and shifts; `InputError` refuses another."""
+    """Return a matrix that rotates, scales uniformly and translates; raise `InputError` for any other."""
     found = torch.eye(4, dtype=torch.float64)
     found[:3] = pose_from_matrix(matrix, where)
     unit = unit_of(found)

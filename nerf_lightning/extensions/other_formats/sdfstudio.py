@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read sdfstudio's frames. `worldtogt` takes their frame to the one that the capture's maker knows."""
+    """Read sdfstudio's frames. `worldtogt` transforms their frame into the one of the capture's author."""
     content = read_json(path)
     frames = entries(content, "frames", f"{path} of sdfstudio")
     beside = sorted({key for frame in frames if isinstance(frame, dict) for key in NOT_READ if frame.get(key)})

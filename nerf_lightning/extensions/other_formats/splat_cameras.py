@@ -1,4 +1,4 @@
-"""`cameras.json` of 3DGS, which SuperSplat and other programs of Gaussian splats write, too, beside pictures."""
+"""`cameras.json` of 3DGS, which SuperSplat and other splat programs also write, next to pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,13 @@ from nerf_lightning.files.json_files import mapping, read_json
 from nerf_lightning.messages.errors import InputError
 
 OUTPUT = ("cfg_args", "point_cloud")
-"""What lies beside cameras.json in the output of 3DGS; pictures there are renderings, which are called otherwise."""
+"""Files next to cameras.json in the output of 3DGS; pictures there are renderings with other names."""
 
 
 def _read(reader: PosedReader, path: Path) -> Capture:
-    """Read pinhole cameras, whose principal point is the picture's middle: 3DGS has no other.
+    """Read pinhole cameras, whose principal point is the picture's center: 3DGS has no other.
 
-    A rotation is camera to world, by rows, with axes right, down, ahead, beside the camera's position.
+    A rotation is camera to world, in row-major order, with axes right, down, forward, with the camera's position.
     """
     root = reader.folder()
     photographs = first_with_pictures(root, FOLDERS)
@@ -47,7 +47,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 
 
 def _suits(folder: Path) -> bool:
-    """Return whether a folder has photographs, or is no output of 3DGS."""
+    """Return whether a folder has photographs, or is not an output of 3DGS."""
     return first_with_pictures(folder, FOLDERS) is not None or not any((folder / name).exists() for name in OUTPUT)
 
 

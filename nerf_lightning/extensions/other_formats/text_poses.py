@@ -1,6 +1,6 @@
-"""Captures with a text file of numbers for each pose: NSVF's `pose/`, and NeRF++'s `train/pose` and `test/pose`.
+"""Captures with a text file of numbers per pose: NSVF's `pose/`, and NeRF++'s `train/pose` and `test/pose`.
 
-Poses are camera to world, axes right, down, ahead.
+Poses are camera to world, axes right, down, forward.
 """
 
 from collections.abc import Iterator
@@ -37,11 +37,11 @@ class NsvfReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the file by which this format is known, where a folder has it."""
+        """Return the file by which this format is recognized, if a folder has it."""
         return "intrinsics.txt" if (folder / "intrinsics.txt").is_file() and (folder / "pose").is_dir() else None
 
     def capture(self) -> Capture:
-        """Return the photographs in order of their names."""
+        """Return the photographs, sorted by name."""
         root = self.folder()
         left_out = LeftOut(str(root / "pose"))
         views = list(_views(root, "", left_out))
@@ -64,7 +64,7 @@ class NerfPlusPlusReader(CaptureReader):
 
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
-        """Return the folder by which this format is known, where a folder has it."""
+        """Return the folder by which this format is recognized, if a folder has it."""
         there = all((folder / "train" / part).is_dir() for part in ("intrinsics", "pose"))
         return "train/intrinsics" if there else None
 
@@ -81,7 +81,7 @@ class NerfPlusPlusReader(CaptureReader):
 
 
 def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
-    """Return the views of a folder with `pose/`, photographs, and intrinsics for each or for all."""
+    """Yield the views of a folder with `pose/`, photographs, and intrinsics for each or for all."""
     place = first_with_pictures(folder, [name for name in PICTURE_FOLDERS if name])
     pictures = {} if place is None else pictures_by_stem(place)
     require_within("views", len(pictures), folder, "views")
@@ -109,7 +109,7 @@ def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
 def intrinsics_of(
     numbers: list[float], size: tuple[int, int]
 ) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
-    """Return fx, fy, cx, cy, and the (width, height) that they hold for: that of the picture where none is said.
+    """Return fx, fy, cx, cy, and the (width, height) that they are for: the picture's if none is given.
 
     The numbers are a matrix of 4 x 4 or 3 x 3; fx, fy, cx, cy; or NSVF's f, cx, cy and others, with height and width
     at the end.
@@ -126,7 +126,7 @@ def intrinsics_of(
 
 
 def first_numbers(path: Path) -> list[float]:
-    """Return the numbers with which a text file begins, at least three; lines that begin with # are left out."""
+    """Return the first numbers of a text file, at least three; lines that begin with # are skipped."""
     found = list[float]()
     lines = [line for line in read_text(path, "text", CURE).splitlines() if not line.startswith("#")]
     for word in " ".join(lines).replace(",", " ").split():
@@ -140,7 +140,7 @@ def first_numbers(path: Path) -> list[float]:
 
 
 def _box(root: Path) -> Float[Tensor, "2 3"] | None:
-    """Return the corners that `bbox.txt` names, where it is there."""
+    """Return the corners in `bbox.txt`, if it exists."""
     if not (root / "bbox.txt").is_file():
         return None
     numbers = torch.tensor(first_numbers(root / "bbox.txt")[:6], dtype=torch.float64)

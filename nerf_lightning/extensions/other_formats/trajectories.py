@@ -1,7 +1,7 @@
 """Captures with all poses in one text file: TUM, Replica, Tanks and Temples, RealEstate10K, Stray Scanner.
 
 Each has a function that reads its lines, and a row in `FORMATS`. Poses are camera to world with axes right, down,
-ahead, but for RealEstate10K's.
+forward, except RealEstate10K's.
 """
 
 import logging
@@ -36,7 +36,7 @@ NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 LINE_OF = rf"[ \t]*{NUMBER}(?:[ \t]+{NUMBER}){{%d}}[ \t]*\r?(?:\n|\Z)"
 """A regular expression of a line of one number and %d more."""
 NEAR_IN_TIME = 0.02
-"""Seconds between a picture and its pose at most, as TUM's own tool has it."""
+"""Maximum seconds between a picture and its pose, as in TUM's own tool."""
 log = logging.getLogger(__name__)
 
 
@@ -65,7 +65,7 @@ def _tum(reader: PosedReader, path: Path) -> Capture:
 
 
 def _replica(reader: PosedReader, path: Path) -> Capture:
-    """Read a matrix per line; the number in a picture's name is that of its line, from 0."""
+    """Read a matrix per line; the number in a picture's name is its line, from 0."""
     params = next((file for folder in path.parents[:2] if (file := folder / "cam_params.json").is_file()), None)
     said = None if params is None else mapping(mapping(read_json(params)).get("camera"))
     lines = list(_lines(path).values())
@@ -94,7 +94,7 @@ def _replica(reader: PosedReader, path: Path) -> Capture:
 
 
 def _tanks(reader: PosedReader, path: Path) -> Capture:
-    """Read blocks of three numbers and a matrix, of the pictures in order."""
+    """Read blocks of three numbers and a matrix, one per picture, in order."""
     lines, names = list(_lines(path).values()), _in_order(reader.pictures())
     reader.given("Tanks and Temples")
     if len(lines) != 5 * len(names):
@@ -136,7 +136,7 @@ def _real_estate(reader: PosedReader, path: Path) -> Capture:
 
 
 def _stray(reader: PosedReader, path: Path) -> Capture:
-    """Read a csv of frames with position, quaternion and, in later versions, intrinsics; depths are millimeters."""
+    """Read a CSV of frames with position, quaternion and, in later versions, intrinsics; depths are in millimeters."""
     root, folder = path.parent, reader.pictures()
     if not pictures_below(folder) or folder == root:
         raise InputError(
@@ -167,14 +167,14 @@ def _stray(reader: PosedReader, path: Path) -> Capture:
 
 
 def _from_quaternion(position: list[float], xyzw: list[float], where: str) -> Pose:
-    """Return the pose of a position and a camera to world quaternion x, y, z, w."""
+    """Return the pose from a position and a camera-to-world quaternion x, y, z, w."""
     x, y, z, w = xyzw
     rotation = rotation_from_quaternion(torch.tensor([w, x, y, z], dtype=torch.float64))
     return from_opencv(torch.cat([rotation, torch.tensor(position, dtype=torch.float64)[:, None]], dim=1), where)
 
 
 def _lines(path: Path) -> dict[str, list[str]]:
-    """Return the words of each line with any, by where it stands; those that begin with # are none."""
+    """Return the words of each non-empty line, by its place; lines that begin with # are skipped."""
     lines = enumerate(read_text(path, "text", CURE).splitlines(), start=1)
     found = {f"line {index}": line.replace(",", " ").split() for index, line in lines if not line.startswith("#")}
     return {place: words for place, words in found.items() if words}
@@ -188,7 +188,7 @@ def _floats(words: list[str]) -> list[float]:
 
 
 def _in_order(folder: Path) -> list[str]:
-    """Return the pictures in order of their names, below their folder."""
+    """Return the pictures sorted by name, relative to their folder."""
     names = [path.relative_to(folder).as_posix() for path in pictures_below(folder)]
     if numeric_order(names) != names:
         raise InputError(

@@ -1,4 +1,4 @@
-"""How much each neuron does, at the points that rays of the training views ask a model's fields about."""
+"""Activity of each neuron, at the points where rays of the training views evaluate a model's fields."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,17 +25,17 @@ NUM_RAYS = 2048
 def mean_activity(
     model: Model, fields: Mapping[str, Field], scene: SceneRecord, key: int, tile_points: int
 ) -> dict[str, list[Float[Tensor, "neurons"]]]:
-    """Return the mean magnitude of what each neuron comes to, by field, layer by layer (`Field.hidden_layers`).
+    """Return the mean magnitude of each neuron's activation, by field, layer by layer (`Field.hidden_layers`).
 
     Args:
         model: on the CPU, in evaluation mode.
-        fields: those of the model that are looked at.
-        scene: whose training views rays start from.
+        fields: the fields of the model to measure.
+        scene: the source of the training views' rays.
         key: of the random numbers.
-        tile_points: most points that go through a field at once.
+        tile_points: maximum number of points that go through a field at once.
 
     Raises:
-        InputError: a field is asked about nothing.
+        InputError: a field is never evaluated.
     """
     asked: list[tuple[str, Points]] = []
     sums: dict[str, list[Tensor]] = {}
@@ -62,7 +62,7 @@ def mean_activity(
 
 @contextmanager
 def _written_down(fields: Mapping[str, Field], asked: list[tuple[str, Points]]) -> Iterator[None]:
-    """Write down what fields are asked about, be it density alone or color."""
+    """Record the points at which fields are evaluated, for density alone or color."""
     hooks = []
     for name, field in fields.items():
 
@@ -84,7 +84,7 @@ def _written_down(fields: Mapping[str, Field], asked: list[tuple[str, Points]]) 
 
 
 def _rays(scene: SceneRecord, key: int) -> RayBundle:
-    """Return rays through pixels of the training views, drawn evenly."""
+    """Return rays through uniformly drawn pixels of the training views."""
     views = torch.tensor(scene.splits["train"])
     draws = batch_random(fold(key, "activity"), NUM_RAYS).uniform("pixel", 3).double()
     view = views[(draws[:, 0] * views.numel()).long()]

@@ -1,4 +1,4 @@
-"""The training that follows a pruning: that of the run again, at the narrower widths, from the weights that stayed."""
+"""Training after pruning: that of the run again, with the narrower widths, from the remaining weights."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,17 +21,17 @@ from nerf_lightning.runs.saved_overrides import former_overrides
 
 
 def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -> list[str] | None:
-    """Return the overrides of `nerf train` that fine-tune a narrower model; None where it takes no steps.
+    """Return the overrides of `nerf train` that fine-tune a narrower model; None if it takes no steps.
 
-    They are those of the run that the checkpoint lies in, as far as a file may say them, and the widths.
+    They are those of the checkpoint's run, as far as a file may set them, and the widths.
 
     Args:
-        checkpoint: the one that was pruned.
-        widths: of the narrower fields, by the names of the modules.
-        steps: how many.
+        checkpoint: the pruned one.
+        widths: of the narrower fields, by module name.
+        steps: number of steps.
 
     Raises:
-        InputError: no number of steps, or the run's folder does not say how it was trained.
+        InputError: an invalid number of steps, or the run's folder does not say how it was trained.
     """
     if steps < 0:
         raise InputError(f"finetune_steps={steps}: give a whole number, 0 for none.")
@@ -44,11 +44,11 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
             f"trained. Leave it out, and fine-tune with nerf train, the run's settings, {_told(widths)} and "
             "init_from=CHECKPOINT."
         )
-    # What a run does at its start alone, a look at the pictures' centers first, is for weights that know nothing.
+    # What a run does only at its start, showing the pictures' centers first, is for untrained weights.
     length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
     former = open_sections([*former_overrides(folder, length), *length])
     config, choices = compose_config("train", former)
-    if choices.get("model") == AUTO:  # what was chosen for the scene
+    if choices.get("model") == AUTO:  # the choices for the scene
         picked = {group: checkpoint.choices.get(group) for group in ("model", "loss")}
         former += [f"{group}={name}" for group, name in picked.items() if name in option_names(group)]
         former += settled(plain_yaml(checkpoint.config, f"The config in {checkpoint.path}"))
@@ -58,7 +58,7 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
 
 
 def fine_tune(overrides: list[str], checkpoint: Path, folder: Path) -> float | None:
-    """Train as `fine_tuning` says from a checkpoint into a run folder of its own; return the PSNR (dB)."""
+    """Train with the overrides of `fine_tuning` from a checkpoint into a new run folder; return the PSNR (dB)."""
     places = [f"init_from={quoted(str(checkpoint))}", f"paths.output_dir={quoted(str(folder))}"]
     with in_words("train"), composed_job("train", [*overrides, *places]) as config:
         set_limits(Budgets(**config.budgets))
@@ -66,7 +66,7 @@ def fine_tune(overrides: list[str], checkpoint: Path, folder: Path) -> float | N
 
 
 def _setting(model: Any, field: str) -> str:
-    """Return the setting of a field's width: of the section that it is composed from, where it is from one."""
+    """Return the setting of a field's width: that of the section that it is composed from, if any."""
     node = model
     for name in field.split("."):
         node = node.get(name) if isinstance(node, dict) else None

@@ -1,4 +1,4 @@
-"""The config of a checkpoint with narrower fields, so that whoever reads it builds them."""
+"""The config of a checkpoint with narrower fields, so that its readers build them."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -15,19 +15,19 @@ from nerf_lightning.nerf.models.base import Model
 
 
 def widths_of(checkpoint: Checkpoint, fields: Sequence[str]) -> dict[str, int]:
-    """Return the width that the config of a checkpoint says each field of its model has.
+    """Return the width of each field of the model in a checkpoint's config.
 
     Raises:
-        InputError: it says none.
+        InputError: it has no width.
     """
     config = _config(checkpoint)
     return {field: _node(config, field, checkpoint)["width"] for field in fields}
 
 
 def with_widths(checkpoint: Checkpoint, widths: Mapping[str, int]) -> str:
-    """Return the config of a checkpoint, as text, with other widths of its model's fields.
+    """Return the config of a checkpoint, as text, with other widths for its model's fields.
 
-    The section `field`, which most of them are composed from, follows the last of them that was as wide.
+    The section `field`, from which most of them are composed, takes the width of the last one that was as wide.
     """
     config = _config(checkpoint)
     wider = copy.deepcopy(config)

@@ -1,4 +1,4 @@
-"""A model made narrower: neurons taken out of every hidden layer of its fields."""
+"""Make a model narrower: remove neurons from every hidden layer of its fields."""
 
 from dataclasses import dataclass
 
@@ -19,12 +19,12 @@ class Pruning:
     """How many neurons stay, and which."""
 
     keep: int | float = 0.5
-    """Share of each layer's neurons."""
+    """Share of each layer's neurons to keep."""
     by: By = "importance"
     weights: Side = "out"
-    """Whose magnitude is importance: of those that read a neuron, of those that make it, or of both."""
+    """The weights whose magnitude is importance: a neuron's outgoing or incoming ones, or both."""
     round_to: int = 16
-    """Widths are its multiples."""
+    """Widths are multiples of it."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -33,7 +33,7 @@ class Pruning:
         require_positive(round_to=self.round_to)
 
     def width(self, there: int, where: str) -> int:
-        """Return how wide a field becomes: the multiple of `round_to` nearest to the share, one of them at least.
+        """Return the new width of a field: the multiple of `round_to` nearest to the share, at least `round_to`.
 
         Raises:
             InputError: less than one neuron would stay.
@@ -47,7 +47,7 @@ class Pruning:
 
 
 def prunable_fields(model: Model) -> dict[str, Field]:
-    """Return a model's fields that know their hidden layers, by the names of the modules."""
+    """Return a model's fields that expose their hidden layers, by module name."""
     return {name: part for name, part in model.named_modules() if isinstance(part, Field) and part.hidden_layers()}
 
 
@@ -55,17 +55,17 @@ def prunable_fields(model: Model) -> dict[str, Field]:
 def prune(
     model: Model, narrower: nn.Module, pruning: Pruning, scene: SceneRecord, tile_points: int
 ) -> dict[str, Tensor]:
-    """Return the state of a narrower model, with the neurons of this one that stay.
+    """Return the state of a narrower model, with the remaining neurons of this one.
 
     Args:
         model: with its weights, on the CPU, in evaluation mode.
-        narrower: the same with smaller widths; its numbers are not looked at, and it may be without memory.
+        narrower: the same with smaller widths; its values are not used, and it may be on `meta`.
         pruning: which neurons stay.
-        scene: from whose training views the neurons' activity is measured.
-        tile_points: most points that go through a field at once.
+        scene: the source of the training views with which activity is measured.
+        tile_points: maximum number of points that go through a field at once.
 
     Raises:
-        InputError: activity is to tell, and rays ask a field about nothing.
+        InputError: activity decides, and rays never evaluate a field.
     """
     fields, state, shapes = prunable_fields(model), model.state_dict(), narrower.state_dict()
     key = fold(pruning.seed, "pruning")

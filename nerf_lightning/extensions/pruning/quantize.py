@@ -1,4 +1,4 @@
-"""Tensors as a checkpoint keeps them in fewer bytes; `checkpoints/quantization.py` reads them back."""
+"""Quantize the tensors of a checkpoint; `checkpoints/quantization.py` reads them back."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -21,13 +21,13 @@ def quantize_rows(
     starts: Sequence[int] = (0,),
     kept: Bool[Tensor, "rows"] | None = None,
 ) -> dict[str, Any]:
-    """Return a table as it is kept: int8 in units of its block's largest magnitude over 127.
+    """Return a quantized table: int8 is in units of its block's largest magnitude over 127.
 
     Args:
-        table: rows of features along the last axis; of one with more than two axes each number is a row.
-        number: the type that its numbers are kept in.
+        table: rows of features along the last axis; with more than two axes, each number is a row.
+        number: the type in which its numbers are stored.
         starts: the first row of each of its blocks (a hash grid's levels).
-        kept: the rows that are; the others come back as their block's mean of them. None: all.
+        kept: the rows to keep; the others are restored as the mean of their block's kept rows. None: all.
     """
     rows = table.detach().float().cpu()
     rows = rows if rows.ndim == 2 else rows.reshape(-1, 1)
@@ -48,7 +48,7 @@ def quantize_rows(
 
 
 def quantize_switches(switches: Tensor) -> dict[str, Any]:
-    """Return a tensor of zeros and ones, of type bool or uint8, as it is kept."""
+    """Return a quantized tensor of zeros and ones, of type bool or uint8."""
     kind = next(name for name, dtype in SWITCHES.items() if dtype == switches.dtype)
     return {"shape": list(switches.shape), "type": kind, "bits": to_bits(switches.flatten().bool().cpu())}
 

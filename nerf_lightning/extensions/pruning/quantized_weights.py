@@ -1,4 +1,4 @@
-"""Which weights of a model a checkpoint keeps in fewer bytes, and how."""
+"""Choose which weights of a model are quantized in a checkpoint, and how."""
 
 import itertools
 from typing import Any
@@ -22,23 +22,23 @@ LARGEST_FLOAT16 = 65504.0
 SWITCHES = ("possible", "cells", "blocks")
 """Of an occupancy grid."""
 CROWDED = 4
-"""With so many vertices in occupied cells for each entry of a table, 1 entry in 50 is left over, and none is told."""
+"""Vertices in occupied cells per entry of a table: from here on only 1 entry in 50 is unused, and all are kept."""
 MARGIN = 0.01
-"""Of a vertex' distance: positions are rounded on their way into both grids."""
+"""Share of the vertices' distance: positions are rounded for both grids."""
 AT_ONCE = 1 << 18
 
 
 def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[str, Any]:
-    """Return a model's weights that are not kept as they are, as `quantize` writes them.
+    """Return a model's quantized weights, as written by `quantize`.
 
     Args:
         model: with its weights, on the CPU.
         tables: the type of the numbers in hash tables.
-        drop_empty: leave out what an occupancy grid rules out: entries of hash tables that no point of an occupied
-            cell looks up, and the densities of empty cells.
+        drop_empty: drop what an occupancy grid rules out: entries of hash tables that no point of an occupied cell
+            looks up, and the densities of empty cells.
 
     Raises:
-        InputError: the model has no tables, or no such grid, or numbers that the type cannot hold.
+        InputError: the model has no tables, or no such grid, or numbers that the type cannot represent.
     """
     encoders = {name: part for name, part in model.named_modules() if isinstance(part, HashGridEncoder)}
     grids = {name: part for name, part in model.named_modules() if isinstance(part, OccupancyGrid)}
@@ -69,9 +69,9 @@ def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dic
 
 
 def reached_entries(level: Level) -> Bool[Tensor, "entries"] | None:
-    """Return which entries of a level's hash grid its rays can look up; None where that cannot be told.
+    """Return which entries of a level's hash grid its rays can look up; None if that is unknown.
 
-    It can where a field sees the box of the occupancy grid that its rays march through, and nothing else.
+    It is known if a field is evaluated only in the box of the occupancy grid that its rays march through.
     """
     sampler, field = level.sampler, level.field
     if not (isinstance(sampler, OccupancySampler) and isinstance(field, NGPField)):
@@ -85,7 +85,7 @@ def reached_entries(level: Level) -> Bool[Tensor, "entries"] | None:
 
 
 def entries_of_cells(layout: HashGridLayout, occupied: Bool[Tensor, "side side side"]) -> Bool[Tensor, "entries"]:
-    """Return which entries of a hash grid points in occupied cells of the unit cube look up; a few more may be told."""
+    """Return which entries of a hash grid points in occupied cells of the unit cube look up, possibly a few more."""
     reached = torch.ones(layout.offsets[-1], dtype=torch.bool)
     cells, side = occupied.nonzero(), occupied.shape[0]
     for number, resolution in enumerate(layout.resolutions):
@@ -99,7 +99,7 @@ def entries_of_cells(layout: HashGridLayout, occupied: Bool[Tensor, "side side s
 
 
 def _vertices(cells: Tensor, side: int, resolution: int) -> Tensor:
-    """Return the vertices of a grid, each once, between which points in cells of another grid lie."""
+    """Return the unique vertices of a grid between which points in cells of another grid are interpolated."""
     low = (cells * resolution / side - MARGIN).floor().long().clamp(min=0)
     high = ((cells + 1) * resolution / side + MARGIN).floor().long() + 1
     high = high.clamp(max=resolution)
@@ -111,7 +111,7 @@ def _vertices(cells: Tensor, side: int, resolution: int) -> Tensor:
 
 
 def _looked_up(vertices: Tensor, layout: HashGridLayout) -> Tensor:
-    """Return the entries of vertices: those that the features there have a gradient with respect to."""
+    """Return the entries of vertices: those with respect to which the features there have a gradient."""
     table = torch.zeros(layout.offsets[-1], 1, requires_grad=True)
     for part in vertices.split(AT_ONCE):
         interpolate_torch(table, part / layout.resolutions[0], layout).sum().backward()

@@ -1,4 +1,4 @@
-"""Which neurons of a hidden layer are kept (Ding et al. 2025, arXiv 2504.00950)."""
+"""Choose which neurons of a hidden layer to keep (Ding et al. 2025, arXiv 2504.00950)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,33 +20,33 @@ class Neurons:
     """A hidden layer's weights."""
 
     incoming: Float[Tensor, "neurons inputs"]
-    """With the bias as its last column, where there is one."""
+    """With the bias as its last column, if any."""
     outgoing: Float[Tensor, "outputs neurons"]
-    """Of all that reads the layer."""
+    """Weights of everything that reads the layer."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The neurons of a layer that stay."""
+    """The neurons of a layer to keep."""
 
     numbers: Int[Tensor, "kept"]
     """Ascending."""
     factors: Float[Tensor, "kept"] | None = None
-    """What their outgoing weights are multiplied with; None: nothing."""
+    """Factors of their outgoing weights; None: unchanged."""
 
 
 def choose(
     layer: Neurons, count: int, by: By, weights: Side, activity: Float[Tensor, "neurons"] | None, key: int
 ) -> Kept:
-    """Return the neurons of a layer that stay; all of them are all, as they are.
+    """Return the neurons of a layer to keep; if all are kept, they stay unchanged.
 
     Args:
         layer: its weights.
-        count: how many stay.
-        by: what tells. importance: the largest mean magnitude of weights; activation: the largest `activity`; random:
-            a uniform choice; coreset: `coreset`.
-        weights: those that importance looks at.
-        activity: mean magnitude of what the neurons come to.
+        count: the number to keep.
+        by: the criterion. importance: the largest mean magnitude of weights; activation: the largest `activity`;
+            random: a uniform choice; coreset: `coreset`.
+        weights: those that importance uses.
+        activity: mean magnitude of the neurons' activations.
         key: of the random numbers.
     """
     there = layer.incoming.shape[0]
@@ -63,7 +63,7 @@ def choose(
 
 
 def importance(layer: Neurons, weights: Side) -> Float[Tensor, "neurons"]:
-    """Return the mean magnitude of each neuron's weights: those that read it, those that make it, or all of them.
+    """Return the mean magnitude of each neuron's weights: outgoing, incoming, or all of them.
 
     >>> layer = Neurons(torch.tensor([[3.0, -1.0], [0.0, 1.0]]), torch.tensor([[-1.0, 5.0]]))
     >>> [importance(layer, side).tolist() for side in ("out", "in")]
@@ -75,20 +75,20 @@ def importance(layer: Neurons, weights: Side) -> Float[Tensor, "neurons"]:
 
 
 def coreset(layer: Neurons, count: int, uniform: Float[Tensor, "draws"]) -> Kept:
-    """Draw neurons with replacement, and weigh them so that what the next layer sums stays the same on average.
+    """Draw neurons with replacement, and weight them so that the next layer's sums stay the same in expectation.
 
     p ~ max|w_out| phi(b |w_in|), m draws, and the weight count / (m p) (Mussay et al., ICLR 2020, arXiv 1907.04018).
-    With phi = ReLU the bound b of the inputs cancels. Neurons that are drawn twice leave places free: undrawn ones take
-    them, the likeliest first, with the weight that the formula has for them, 0, from which fine-tuning may raise them.
+    With phi = ReLU the bound b of the inputs cancels. Neurons that are drawn twice leave slots free: undrawn ones fill
+    them, the likeliest first, with their weight in the formula, 0, from which fine-tuning may raise them.
 
     Args:
         layer: the layer's weights.
-        count: how many neurons stay.
-        uniform: the m numbers in [0, 1) that neurons are drawn with.
+        count: the number of neurons to keep.
+        uniform: the m numbers in [0, 1) used to draw neurons.
     """
     sensitivity = (layer.outgoing.abs().amax(dim=0) * layer.incoming.norm(dim=1)).double()
     if not bool(sensitivity.sum() > 0):
-        sensitivity = torch.ones_like(sensitivity)  # nothing is read, so that all are alike
+        sensitivity = torch.ones_like(sensitivity)  # nothing is read, so all are equal
     p = sensitivity / sensitivity.sum()
     reach = p.cumsum(0)
     drawn = torch.searchsorted(reach, uniform.double() * reach[-1], right=True).clamp(max=p.numel() - 1)
@@ -116,7 +116,7 @@ def neurons_of(state: Mapping[str, Tensor], layer: HiddenLayer) -> Neurons:
 
 
 def narrowed(state: Mapping[str, Tensor], kept: Mapping[HiddenLayer, Kept]) -> dict[str, Tensor]:
-    """Return a field's state with the neurons that stay, in the order that they had."""
+    """Return a field's state with the kept neurons, in their original order."""
     narrow = dict(state)
     for layer, stays in kept.items():
         there = state[layer.rows[0]].shape[0]

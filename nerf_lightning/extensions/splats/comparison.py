@@ -1,4 +1,4 @@
-"""Splats and field on held-out views, against the photographs, or, without them, against each other."""
+"""Compare splats and field on held-out views with the photographs, or, without these, with each other."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,10 +18,10 @@ from nerf_lightning.nerf.types.scene import Background, Scene
 
 @dataclass(frozen=True)
 class Comparison:
-    """Means over some views."""
+    """Mean metrics over some views."""
 
     views: str
-    """How many of which split."""
+    """Number of views and their split."""
     splats: dict[str, Any]
     field: dict[str, Any] | None
     """None: there are no photographs, and the field's renders are the truth for the splats."""
@@ -29,7 +29,7 @@ class Comparison:
     """Pictures of the first view, by name."""
 
     def psnr(self) -> str:
-        """Return what a person may want to know."""
+        """Return a summary for the user."""
         said = f"{self.splats['psnr']:.2f} dB on {self.views}"
         if self.field is None:
             return f"{said}, with the field's renders as the truth"
@@ -51,7 +51,7 @@ def compared(
     tile_points: int,
     report: Report,
 ) -> Comparison:
-    """Draw held-out views by `gaussians`, which may be rounded, and by the field; without any, those of training."""
+    """Render held-out views, or else training views, with `gaussians`, which may be rounded, and with the field."""
     scene, pinholes = found.scene, found.pinholes
     split = next(name for name in ("test", "val", "train") if scene.splits.get(name))
     views = evenly_spaced_subset(scene.splits[split], max_views)

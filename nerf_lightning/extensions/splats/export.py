@@ -1,4 +1,4 @@
-"""Export splats: fit them, compare them with the field, write them."""
+"""Export splats: fit them, compare them with the field, and write them."""
 
 import json
 import time
@@ -33,7 +33,7 @@ from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 
 @dataclass
 class SplatsExport(SplatFitting):
-    """Write `splats.ply` (or another format), `splats.json` with what was measured, and `splats.png` to look at.
+    """Write `splats.ply` (or another format), `splats.json` with measurements, and `splats.png` for inspection.
 
     Args:
         num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
@@ -88,9 +88,9 @@ class SplatsExport(SplatFitting):
         return [path, facts, picture]
 
     def _to_file(self, record: SceneRecord) -> Float64[Tensor, "4 4"]:
-        """Return what takes scene coordinates to the file's: the capture's own, or turned until y points down.
+        """Return the transform from scene to file coordinates: the capture's own, or rotated until y points down.
 
-        glTF and USD also want meters, as far as they are known.
+        glTF and USD also require meters, if known.
         """
         to_user = record.to_user.double()
         if self.frame == "capture" and self.format not in IN_METERS:

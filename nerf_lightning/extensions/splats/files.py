@@ -1,6 +1,6 @@
-"""Splat files: PLY as 3DGS wrote it, SPZ 3 (Niantic), SOG 2 (PlayCanvas), USDA, and glTF (KHR_gaussian_splatting).
+"""Splat files: PLY as in 3DGS, SPZ 3 (Niantic), SOG 2 (PlayCanvas), USDA, and glTF (KHR_gaussian_splatting).
 
-Each is whole or not there. The axes of PLY and SOG are right, down, front; those of the others are right, up, back, so
+Each is written atomically. The axes of PLY and SOG are right, down, front; those of the others are right, up, back, so
 y and z are negated there.
 """
 
@@ -31,14 +31,14 @@ from nerf_lightning.nerf.types.scene import Cameras
 
 SplatFormat = Literal["ply", "spz", "sog", "glb", "usda"]
 IN_METERS = ("glb", "usda")
-"""Formats that state their unit and what is up."""
-FINE = 0.05  # SPZ's places are whole numbers of steps, so large a share of the splats' median size or smaller.
-LARGEST_PLACE = 1 << 23  # And so many steps from the origin.
+"""Formats that define their unit and up."""
+FINE = 0.05  # SPZ's positions are integer multiples of a step, at most this share of the splats' median size.
+LARGEST_PLACE = 1 << 23  # Maximum number of steps from the origin.
 HALF_TURN = torch.diag(torch.cat([TURN, torch.ones(1)])).double()
 
 
 def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
-    """Return splats in the frame that a similarity (float64) takes theirs to: places, sizes, axes and colors."""
+    """Transform splats by a similarity (float64): positions, sizes, axes and colors."""
     unit = unit_of(matrix)
     rotation = matrix[:3, :3] / unit
     axes = rotation @ rotation_from_quaternion(gaussians.quaternions.double())
@@ -55,10 +55,10 @@ def moved(gaussians: Gaussians, matrix: Float[Tensor, "4 4"]) -> Gaussians:
 def turned_harmonics(
     sh_rest: Float[Tensor, "n coefficients 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n coefficients 3"]:
-    """Return the coefficients of the same colors in a turned frame.
+    """Return the coefficients of the same colors in a rotated frame.
 
-    The harmonics of a degree turn among themselves: Y(R^T d) = Y(d) M for every direction d. Here M is what least
-    squares finds for more directions than harmonics, which is exact.
+    The harmonics of a degree transform among themselves: Y(R^T d) = Y(d) M for every direction d. Here M is the
+    least-squares solution for more directions than harmonics, which is exact.
     """
     count = sh_rest.shape[1]
     if not count:
@@ -75,8 +75,8 @@ def save_splats(path: Path, gaussians: Gaussians, cameras: Cameras | None = None
 
     Args:
         path: the file.
-        gaussians: whose axes are right, down, front.
-        cameras: in the same frame, for formats that have some; None: none are written.
+        gaussians: splats with axes right, down, front.
+        cameras: in the same frame, for formats with cameras; None: none are written.
     """
     with whole_file(path) as part:
         if path.suffix == ".ply":
@@ -93,12 +93,12 @@ def save_splats(path: Path, gaussians: Gaussians, cameras: Cameras | None = None
 
 
 def moved_cameras(cameras: Cameras, matrix: Float[Tensor, "4 4"]) -> Cameras:
-    """Return cameras in the frame that a similarity (float64) takes theirs to."""
+    """Transform cameras by a similarity (float64)."""
     return replace(cameras, c2w=carried(cameras.c2w, matrix))
 
 
 def ply_bytes(gaussians: Gaussians) -> bytes:
-    """Return the file of 3DGS: one row of floats for each splat, all of them before any activation."""
+    """Return a file as in 3DGS: one row of floats per splat, all before their activations."""
     rest = gaussians.sh_rest.shape[1]
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{c}" for c in range(3)), *(f"f_rest_{k}" for k in range(3 * rest))]
     names += ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
@@ -113,7 +113,7 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
 
 
 def write_spz(path: Path, splats: Gaussians) -> None:
-    """Write SPZ 3 by gsply, which writes numbers as they are."""
+    """Write SPZ 3 by gsply, which writes numbers unchanged."""
     gsply = require_library()
     size = splats.log_scales.amax(dim=1).exp().median()
     farthest = float(splats.means.abs().max().clamp(min=1e-6))
@@ -131,13 +131,13 @@ def write_spz(path: Path, splats: Gaussians) -> None:
 
 
 def _coarse(sh_rest: Float[Tensor, "n coefficients 3"]) -> Float[Tensor, "n coefficients 3"]:
-    # 5 bits of degree 1 and 4 of the others, as the format's own program has it: gzip makes half of that.
+    # 5 bits for degree 1 and 4 for the others, as in the format's own program: gzip halves that.
     steps = torch.tensor([16.0] * 3 + [8.0] * (sh_rest.shape[1] - 3))[: sh_rest.shape[1], None]
     return (sh_rest * steps).round() / steps
 
 
 def glb_bytes(gaussians: Gaussians) -> bytes:
-    """Return binary glTF: a primitive of points whose attributes are the splats', after their activations."""
+    """Return binary glTF: a point primitive whose attributes are the splats', after their activations."""
     prefix, rest = "KHR_gaussian_splatting:", gaussians.sh_rest
     attributes = {
         "POSITION": gaussians.means,
@@ -190,7 +190,7 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
 
 
 def require_library(module: str = "gsply") -> Any:
-    """Return gsply, or say how it is installed."""
+    """Return gsply, or report how to install it."""
     return require_extra(module, "splats", "Exporting splats as SPZ (what.format=spz)")
 
 

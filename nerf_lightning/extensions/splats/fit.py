@@ -1,7 +1,7 @@
 """Fit splats to pictures: Adam on every number, with rates for each kind, as Kerbl et al. 2023 (arXiv 2308.04079).
 
-They begin on surfaces and not as a few points, and have a minute and not an hour: rates are larger, fall faster, and
-what is transparent gives its place to what the gradient on the screen says is too coarse.
+They begin on surfaces instead of as a few points, and have a minute instead of an hour: rates are larger and decay
+faster, and transparent splats are replaced by splitting those that are too coarse by the gradient on the screen.
 """
 
 import math
@@ -23,39 +23,39 @@ from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.types.scene import DRAWN, Background
 
 BETAS, EPS = (0.9, 0.99), 1e-15
-LAST_RATE = 0.05  # Of the last step, as a share of the first.
+LAST_RATE = 0.05  # Rate of the last step, as a share of the first.
 RATES = {"log_scales": 2e-2, "quaternions": 8e-3, "opacity_logits": 1e-1, "sh_dc": 2e-2, "sh_rest": 4e-3}
-MEANS_RATE = 6e-4  # In extents of the scene.
+MEANS_RATE = 6e-4  # In units of the scene's extent.
 TAUGHT_EVERY = 3  # Steps.
-EVERY = 100  # Steps between two rounds of pruning and splitting,
-UNTIL = 0.7  # and the share of the time in which there are any.
-LEAST_OPACITY = 0.005  # What is less opaque goes.
-GROWTH = 0.1  # At most so many are split in one round, as a share of all.
-SMALLER = 1.6  # By which the two parts of a splat are smaller than it.
+EVERY = 100  # Steps between rounds of pruning and splitting,
+UNTIL = 0.7  # and the share of the time with such rounds.
+LEAST_OPACITY = 0.005  # Less opaque splats are removed.
+GROWTH = 0.1  # Maximum share of splats that are split in one round.
+SMALLER = 1.6  # Factor by which the two parts of a splat are smaller.
 LEAST_VARIANCE = 0.15
 """Pixels^2 along each axis of a splat (arXiv 2311.16493, Sec. 5.1): thinner ones vanish in larger pictures."""
 
 
 @dataclass
 class Fitting:
-    """What is asked for."""
+    """Settings of the fit."""
 
     budget: int
-    """At most so many splats."""
+    """Maximum number of splats."""
     seconds: float
-    """Above 0."""
+    """Duration, above 0."""
     background: Background
     extent: float
-    """How far the cameras are apart, about (scene units): what steps of the means are measured in."""
+    """Approximate extent of the cameras (scene units), the unit of the means' steps."""
     seed: int = 0
 
 
 def fit(
     gaussians: Gaussians, photographs: Sequence[View], taught: Sequence[View], fitting: Fitting, report: Report
 ) -> Gaussians:
-    """Return splats whose pictures are nearer to the views' after some seconds; one view a step, in random order.
+    """Fit splats to the views for some seconds, with one view per step in random order.
 
-    One in `TAUGHT_EVERY` is the field's, which knows what no photograph shows; all, where there are no photographs.
+    One in `TAUGHT_EVERY` is the field's, which knows what no photograph shows; all are, without photographs.
     """
     cameras = [view.camera for view in photographs or taught]
     state, generator = _State(gaussians, fitting.extent, cameras), torch.Generator().manual_seed(fitting.seed)
@@ -79,13 +79,13 @@ def _in_random_order(views: Sequence[View], generator: torch.Generator) -> Itera
 
 
 def _background(background: Background, generator: torch.Generator) -> Float[Tensor, "3"]:
-    if background in DRAWN:  # a haze would take its color
+    if background in DRAWN:  # a haze would take on its color
         return torch.rand(3, generator=generator)
     return color_behind(background)
 
 
 class _State:
-    """Splats that learn: their moments, and what the screen says of each."""
+    """Splats in training, with their moments and statistics on the screen."""
 
     def __init__(self, gaussians: Gaussians, extent: float, cameras: Sequence[Pinhole]):
         self.gaussians = gaussians.map(lambda each: each.clone().requires_grad_())
@@ -97,7 +97,7 @@ class _State:
         self.finest = self._finest()
 
     def learn(self, view: View, background: Float[Tensor, "3"], rate: float) -> float:
-        """Take one step of Adam, and return the loss."""
+        """Take one Adam step and return the loss."""
         on_screen = torch.zeros(len(self.gaussians), 2, requires_grad=True)
         picture = rasterize(self.gaussians, view.camera, background, on_screen)
         error = picture - view.over(background)
@@ -119,12 +119,12 @@ class _State:
         return float(loss.detach())
 
     def _finest(self) -> Float[Tensor, "n"]:
-        """Return the least logarithm of each splat's standard deviations: `LEAST_VARIANCE` to the nearest camera."""
+        """Return the minimum logarithm of each splat's standard deviations: `LEAST_VARIANCE` for the nearest camera."""
         pixels = torch.cdist(self.gaussians.means.detach(), self.eyes) * self.pixels
         return pixels.amin(dim=-1).clamp(min=1e-12).log() + 0.5 * math.log(LEAST_VARIANCE)
 
     def refine(self, budget: int, generator: torch.Generator) -> None:
-        """Prune what is transparent, and split what moves most on the screen, up to the budget."""
+        """Prune transparent splats, and split those with the largest gradients on the screen, up to the budget."""
         former = self.gaussians.map(lambda each: each.detach())
         kept = former.opacity_logits.sigmoid() > LEAST_OPACITY
         error = torch.where(kept, self.error, -1.0)

@@ -1,4 +1,4 @@
-"""Fit splats to a trained field and its photographs: what exports of splats share."""
+"""Fit splats to a trained field and its photographs: the base of splat exports."""
 
 import math
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class FittedSplats:
 
     gaussians: Gaussians
     scene: SceneRecord
-    """The views that splats and field are compared on: a `Scene`, if there are photographs of them."""
+    """The views on which splats and field are compared: a `Scene`, if there are photographs."""
     pinholes: Cameras
     """Their cameras without lenses."""
     truth: Literal["photographs", "the field"]
@@ -37,13 +37,13 @@ class FittedSplats:
 
     @property
     def focal(self) -> float:
-        """The mean focal length of the pictures that they were fitted to (pixels)."""
+        """Mean focal length in pixels of the pictures that they were fitted to."""
         return float(self.pinholes.focal.mean())
 
 
 @dataclass
 class SplatFitting(Export):
-    """An export that fits splats: its settings, and the fitting."""
+    """An exporter that fits splats: its settings, and the fitting."""
 
     needs_photographs = True
     kernels = KERNELS
@@ -65,7 +65,7 @@ class SplatFitting(Export):
         require_setting("max_views", self.max_views, self.max_views >= 0, "give 0 or more.")
 
     def stages(self) -> dict[str, float]:
-        """Return what takes how long, in seconds or so."""
+        """Return the approximate seconds of each stage."""
         return STAGES | {"fitting": self.seconds}
 
     def fitted(
@@ -73,8 +73,8 @@ class SplatFitting(Export):
     ) -> FittedSplats:
         """Return splats that begin on the field's surfaces, fitted to the photographs.
 
-        Without photographs they are fitted to renders of the field; so they are if the model has a correction for each
-        photograph that cannot be taken back.
+        Without photographs, or if the model's correction of each photograph cannot be undone, they are fitted to
+        renders of the field.
         """
         for module in self.kernels:
             require_kernels(module, "Fitting splats")
@@ -106,7 +106,7 @@ def _photographs(record: SceneRecord, run: RunContext) -> Scene | None:
 
 
 def as_faces(record: SceneRecord) -> SceneRecord:
-    """Return a record of panoramas with the six faces of a cube for each: splats are fitted to pinhole pictures."""
+    """Replace each panorama of a record by six cube faces: splats are fitted to pinhole pictures."""
     views = torch.arange(len(record.view_names)).repeat_interleave(6)
     return replace(
         record,
@@ -119,9 +119,9 @@ def as_faces(record: SceneRecord) -> SceneRecord:
 
 
 def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral: Neutral | None = None) -> list[View]:
-    """Return the photographs that the model learned from, by its record, and of which anything counts.
+    """Return the photographs that the model was trained on, by its record, except fully masked ones.
 
-    `neutral` takes back what its correction learned of each.
+    `neutral` undoes its learned correction of each.
     """
     trained = {record.view_names[view] for view in record.splits["train"]}
     known = [view for view in scene.splits["train"] if scene.view_names[view] in trained]
@@ -130,7 +130,7 @@ def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral
         view = photographed(scene, number, pinholes)
         if neutral is not None:
             rgb = neutral(view.rgba[..., :3] / 255.0, scene.view_names[number])
-            assert rgb is not None  # or nothing would be fitted to photographs
+            assert rgb is not None  # otherwise nothing is fitted to photographs
             view = replace(view, rgba=torch.cat([to_bytes(rgb), view.rgba[..., 3:]], dim=-1))
         if view.kept is None or bool(view.kept.any()):
             views.append(view)
@@ -138,6 +138,6 @@ def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral
 
 
 def extent(cameras: Cameras) -> float:
-    """Return how far the cameras are from their middle, at most (scene units)."""
+    """Return the maximum distance of the cameras from their center (scene units)."""
     eyes = cameras.c2w[:, :, 3]
     return max(float((eyes - eyes.mean(dim=0)).norm(dim=-1).max()), 1e-6)

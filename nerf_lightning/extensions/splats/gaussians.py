@@ -1,4 +1,4 @@
-"""3D Gaussian splats, and what one looks like through a camera (Kerbl et al. 2023, arXiv 2308.04079).
+"""3D Gaussian splats, and their projection through a camera (Kerbl et al. 2023, arXiv 2308.04079).
 
 Letters: `mean` m and `covariance` S of a Gaussian in the world, W the world-to-camera rotation (rows right, down,
 forward), (x, y, z) the mean in camera axes, J the Jacobian of the perspective (x fx / z, y fy / z) there, `conic` the
@@ -19,23 +19,23 @@ from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras
 
 DILATION = 0.1
-"""Pixels^2 that are added to each covariance on the screen, so that no splat falls between two pixels.
+"""Pixels^2 added to each covariance on the screen, so that no splat falls between two pixels.
 
-Viewers add 0.3 whatever the picture's size: as much as this in one 1.7 times as large as those fitted to.
+Viewers add 0.3 for any picture size: equivalent to this for a picture 1.7 times as large as those fitted to.
 """
 LEAST_ALPHA, LARGEST_ALPHA = 1.0 / 255.0, 0.99
-"""What is less opaque is not drawn, and nothing is more opaque."""
+"""Less opaque contributions are not drawn, and larger alphas are clamped."""
 LEAST_LIGHT = 1e-4
 """Splats behind less transmittance are not drawn."""
 MARGIN = 1.3
-"""The Jacobian is taken at most so many times as far from the axis as the picture reaches: beyond, it explodes."""
+"""Factor beyond the picture's extent at which the Jacobian's distance from the axis is clamped: it would explode."""
 TURN = torch.tensor([1.0, -1.0, -1.0])
 """From a camera's axes right, up, back to right, down, forward."""
 
 
 @dataclass
 class Gaussians:
-    """N splats. All numbers are as files have them: before the exponential, the logistic function, and the offset."""
+    """N splats. All numbers are as in files: before the exponential, the logistic function, and the offset."""
 
     means: Float[Tensor, "n 3"]
     log_scales: Float[Tensor, "n 3"]
@@ -44,7 +44,7 @@ class Gaussians:
     """(w, x, y, z) of the rotation whose columns are the splat's axes; normalized wherever it is used."""
     opacity_logits: Float[Tensor, "n"]
     sh_dc: Float[Tensor, "n 3"]
-    """Spherical harmonics of the color, which is 0.5 plus their sum, and not below 0: the one that is constant,"""
+    """Spherical harmonics of the color, which is 0.5 plus their sum, clamped at 0: the constant one,"""
     sh_rest: Float[Tensor, "n coefficients 3"]
     """and the 0, 3, 8 or 15 of degree 1 to 3."""
 
@@ -61,13 +61,13 @@ class Gaussians:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Gaussians":
-        """Return splats whose tensors are changed: `gaussians.map(lambda each: each[kept])`."""
+        """Return splats with transformed tensors: `gaussians.map(lambda each: each[kept])`."""
         return Gaussians(**{name: change(each) for name, each in self.tensors().items()})
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One camera as rasterizers take it."""
+    """One camera for rasterizers."""
 
     rotation: Float[Tensor, "3 3"]
     """W: world to camera, rows right, down, forward."""
@@ -77,11 +77,11 @@ class Pinhole:
     width: int
     height: int
     near: float
-    """Splats whose mean is nearer, along the axis, are not drawn (scene units)."""
+    """Splats whose mean is nearer along the axis (scene units) are not drawn."""
 
     @classmethod
     def of(cls, cameras: Cameras, view: int, near: float) -> "Pinhole":
-        """Return one of the cameras without its lens; in normalized device coordinates content begins at z = -1."""
+        """Return one of the cameras without its lens; in normalized device coordinates, content begins at z = -1."""
         c2w = cameras.c2w[view]
         near = near if cameras.ndc is None else 1.0 + float(c2w[2, 3])
         (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
@@ -130,7 +130,7 @@ def jacobian_limits(camera: Pinhole) -> tuple[float, float]:
 
 
 def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-    """Return the colors seen from a place; no gradient goes through the direction, which hardly moves."""
+    """Return the colors seen from `eye`; no gradient flows through the direction, which hardly changes."""
     directions = normalize(gaussians.means.detach() - eye, dim=-1)
     basis = SphericalHarmonicsEncoder(gaussians.sh_degree + 1)(directions)
     sh = torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], dim=1)
@@ -138,5 +138,5 @@ def colors(gaussians: Gaussians, eye: Float[Tensor, "3"]) -> Float[Tensor, "n 3"
 
 
 def dc_of_color(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return the constant coefficient of a color that is the same from everywhere."""
+    """Return the constant coefficient of a view-independent color."""
     return (rgb - 0.5) / DEGREE_1

@@ -1,8 +1,8 @@
-"""What the field shows around the photographs, and where splats begin: on its surfaces, flat.
+"""Render the field around the photographs, and initialize flat splats on its surfaces.
 
-3DGS begins with the few points of structure from motion and makes more of them as it goes; a field knows a point, a
-normal and a color for every pixel. It is looked at from between the photographs and beyond, through wider lenses: what
-few photographs see, or none, is where splats would go wrong.
+3DGS begins with the few points of structure from motion and adds more during training; a field provides a point, a
+normal and a color for every pixel. It is rendered from between the photographs and beyond, with a wider field of view:
+splats would go wrong where few or no photographs see anything.
 """
 
 from collections.abc import Sequence
@@ -23,35 +23,35 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import straight_colors
 
-COUNT, LONGEST = 60, 320  # Views of the field, and the longer side of each in pixels.
-WIDER = 1.25  # How much more they see across than the photographs,
-WIDEST = 2.0  # and every other one where the scene has no box: windows are wider than photographs.
-NEAREST = 4  # A place is between a view and one of so many that are nearest to it,
-BEYOND = 0.5  # or beyond one of the two, by up to this share of the way.
-LEAST_OPACITY = 0.5  # Pixels that stop less light see no surface.
-TOLERANCE = 0.03  # Of the distance: a point stays where the surface of one of the nearest views is as near.
+COUNT, LONGEST = 60, 320  # Number of views of the field, and the longer side of each in pixels.
+WIDER = 1.25  # Factor by which they are wider than the photographs,
+WIDEST = 2.0  # and every other one if the scene has no box: windows are wider than photographs.
+NEAREST = 4  # A position is between a view and one of this many nearest ones,
+BEYOND = 0.5  # or beyond one of the two, by up to this share of the distance.
+LEAST_OPACITY = 0.5  # Pixels with lower opacity see no surface.
+TOLERANCE = 0.03  # Share of the distance: a point is kept if one of the nearest views has its surface there.
 OPACITY = 0.6
 SPREAD = 0.4  # Standard deviation along the surface, in distances to the three nearest neighbors.
-FLAT = 0.2  # And across it, as a share of that.
+FLAT = 0.2  # Across it, as a share of that.
 NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the field shows."""
+    """Renders of the field."""
 
     cameras: Cameras
     near: float
     seen: list[SeenView]
 
     def views(self) -> list[View]:
-        """Return pictures to fit to, with the field's opacity for alpha."""
+        """Return pictures to fit to, with the field's opacity as alpha."""
         cameras = [Pinhole.of(self.cameras, view, self.near) for view in range(len(self.seen))]
         return [View(camera, _rgba(seen)) for camera, seen in zip(cameras, self.seen, strict=True)]
 
 
 def look_around(model: Model, record: SceneRecord, tile_points: int, seed: int, report: Report) -> Surroundings:
-    """Render the field from places around those of the training views."""
+    """Render the field from positions around the training views."""
     pinholes, views = without_lens(record.cameras, LONGEST), list(record.splits["train"])
     wider = torch.tensor([WIDER, WIDER if record.space == "bounded" else WIDEST]).repeat(COUNT // 2)
     cameras = _between(pinholes, views, torch.Generator().manual_seed(seed))
@@ -66,7 +66,7 @@ def look_around(model: Model, record: SceneRecord, tile_points: int, seed: int, 
 
 
 def _between(cameras: Cameras, views: Sequence[int], generator: torch.Generator) -> Cameras:
-    # Axes are mixed like centers, and then the nearest rotation is taken, by SVD.
+    # Axes are interpolated like centers, then projected to the nearest rotation by SVD.
     order = torch.randperm(max(COUNT, len(views)), generator=generator)[:COUNT].tolist()
     chosen, others = [views[k % len(views)] for k in order], []
     for view in chosen:
@@ -80,9 +80,9 @@ def _between(cameras: Cameras, views: Sequence[int], generator: torch.Generator)
 
 
 def initial_gaussians(around: Surroundings, num_splats: int, sh_degree: int, seed: int) -> Gaussians:
-    """Return so many splats, or fewer where fewer pixels see a surface that a second view confirms.
+    """Return `num_splats` splats, or fewer if fewer pixels see a surface that a second view confirms.
 
-    Far things have pixels like near ones, and so as many splats, large ones.
+    Distant objects cover pixels like near ones, and so get as many, but larger, splats.
 
     Raises:
         InputError: no pixel sees a surface.
@@ -130,7 +130,7 @@ def _flat_gaussians(
 
 
 def towards(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Return unit quaternions whose rotations take the z axis to the normals or their opposites; of zeros to itself.
+    """Return unit quaternions that rotate the z axis to the normals or their opposites; the identity for zeros.
 
     >>> towards(torch.tensor([[1.0, 1.0, 0.0]])).tolist()
     [[0.5773502588272095, -0.5773502588272095, 0.5773502588272095, 0.0]]

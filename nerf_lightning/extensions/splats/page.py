@@ -1,4 +1,4 @@
-"""The scene as one page that anyone can open and walk around in: no server, no network, no program."""
+"""The scene as one page that anyone can open and explore: no server, no network, no program."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +17,12 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-MARKS = "views.json"  # What is kept next to the page.
+MARKS = "views.json"  # Kept next to the page.
 
 
 @dataclass
 class PageExport(SplatFitting):
-    """Write `page.html`: the scene as splats, with what draws them, the cameras and small photographs.
+    """Write `page.html`: the scene as splats, with their renderer, the cameras and small photographs.
 
     Args:
         num_splats: maximum number of splats; auto: 200 times the square root of a view's number of
@@ -56,7 +56,7 @@ class PageExport(SplatFitting):
     def export(
         self, model: Model, record: SceneRecord, folder: Path, tile_points: int, run: RunContext = MODEL_ALONE
     ) -> list[Path]:
-        """Write the page, and say how much of the model's quality it shows."""
+        """Write the page, and print how its quality compares with the model's."""
         target = folder / "page.html"
         if target.is_dir() or (target.exists() and not is_scene_page(target)):
             kind = "a folder" if target.is_dir() else "a file that is not a page of this program"

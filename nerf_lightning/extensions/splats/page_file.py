@@ -1,4 +1,4 @@
-"""A page as a file: what stands in it."""
+"""The content of a page file."""
 
 import base64
 import io
@@ -34,13 +34,13 @@ from nerf_lightning.visualization.pictures import to_bytes
 FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
 SHADERS = ("splats.vert", "splats.frag")
-NEAR_NDC = 0.2  # Of the distance at which content begins.
-INSIDE = 0.01  # So large a share of the splats lies beyond either side of the box that one turns around.
+NEAR_NDC = 0.2  # Share of the distance at which content begins.
+INSIDE = 0.01  # Share of the splats beyond either side of the box around which the view orbits.
 BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
-STILL, PHOTOGRAPH = 640, 320  # Pixels of the longer side: of the still picture, of photographs.
+STILL, PHOTOGRAPH = 640, 320  # Longer side in pixels of the still picture, and of photographs.
 JPEG_QUALITY = 80
-PART_OF_PANORAMA = 1.5  # How much is seen around a panorama's direction, in radians.
-# Cameras that leave a wider gap do not stand all around: the page then turns to and fro, so far to either side at most.
+PART_OF_PANORAMA = 1.5  # Field of view around a panorama's direction, in radians.
+# With a wider gap, cameras do not surround the scene: the page then sways, at most this far to either side.
 WIDEST_GAP, MOST_SWAY = 120.0, 20.0  # Degrees.
 
 
@@ -50,7 +50,7 @@ class ViewOnPage:
 
     name: str
     source: str
-    """The photograph, as an address; empty where there is none."""
+    """The photograph as a data URL; empty if there is none."""
 
 
 def write_page(
@@ -65,10 +65,10 @@ def write_page(
     title: str | None = None,
     first_view: str | None = None,
 ) -> None:
-    """Write the page of splats, with what is known of them, and one to `max_photographs` places to jump to.
+    """Write the page of splats, with facts about them, and one to `max_photographs` places to jump to.
 
-    `focal` is that of the pictures that they were fitted to, in pixels. The view of `marks`, or the photograph, that is
-    called `first_view` is shown first; None: the training view nearest to their average.
+    `focal` is that of the pictures that they were fitted to, in pixels. The view of `marks`, or the photograph, named
+    `first_view` is shown first; None: the training view nearest to their average.
     """
     packed, shown = splats.packed(), splats.gaussians()
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
@@ -97,7 +97,7 @@ def write_page(
         "up": up.tolist(),
         "path": list(run.keyframes),
         "to_user": record.to_user.tolist(),
-        # A film has the shape of the first photograph.
+        # A film has the aspect ratio of the first photograph.
         "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
     }
     page = {
@@ -127,9 +127,9 @@ def write_page(
 
 
 def average_view(record: SceneRecord, views: Sequence[int]) -> int:
-    """Return that of the views, a training view if any is, whose camera is nearest to the training cameras' mean.
+    """Return the view, a training view if any, whose camera is nearest to the training cameras' mean.
 
-    The model knows most about what lies there, and it is held as most photographs are.
+    The model knows most about what is there, and it is oriented like most photographs.
     """
     train = set(record.splits["train"])
     candidates = [view for view in views if view in train] or list(views)
@@ -141,7 +141,7 @@ def average_view(record: SceneRecord, views: Sequence[int]) -> int:
 
 
 def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -> float | None:
-    """Return how far the page turns to either side, in radians; None: all around, as the training cameras stand."""
+    """Return how far the page turns to either side, in radians; None: all around, like the training cameras."""
     away = record.cameras.c2w[list(record.splits["train"]), :, 3] - torch.tensor(middle)
     first = functional.normalize(away[0] - (away[0] @ up) * up, dim=0)
     azimuth = torch.rad2deg(torch.atan2(away @ torch.linalg.cross(up, first), away @ first))
@@ -150,7 +150,7 @@ def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -
 
 
 def _middle(splats: Gaussians, record: SceneRecord) -> tuple[list[float], float]:
-    """Return what one turns around, and how far things are from it, in the world."""
+    """Return the center of the orbit, and the distance of the content from it, in the world."""
     if record.space == "ndc":
         return [0.0, 0.0, -2.0], 1.0
     lower, upper = record.aabb
@@ -160,7 +160,7 @@ def _middle(splats: Gaussians, record: SceneRecord) -> tuple[list[float], float]
 
 
 def _nearest(record: SceneRecord) -> float:
-    """Return how near, along the axis of a camera, splats are drawn."""
+    """Return the minimum distance along a camera's axis at which splats are drawn."""
     return NEAR_NDC if record.space == "ndc" else float(record.near.min())
 
 
@@ -184,7 +184,7 @@ def _view(record: SceneRecord, run: RunContext, view: int | None) -> ViewOnPage:
     if view is None:
         return ViewOnPage("start", "")
     name, scene = record.view_names[view], run.photographs
-    # A panorama would not lie over what is seen from its place.
+    # A panorama would not match what is seen from its position.
     if scene is None or name not in scene.view_names or record.cameras.lens_model == "equirectangular":
         return ViewOnPage(name, "")
     return ViewOnPage(name, _jpeg(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))

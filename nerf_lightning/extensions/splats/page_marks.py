@@ -6,7 +6,7 @@
  "distances": [{"from": [0, 0, 0], "to": [0, 0, 1.5]}]}
 
 Points are in the frame and the units of the capture's own files; `fov` is in degrees across the width. A view may name
-a photograph, whose camera it takes. Each list may be left out.
+a photograph, whose camera it uses. Each list may be omitted.
 """
 
 import math
@@ -31,7 +31,7 @@ LONGEST = 1000  # Characters of a text.
 
 
 def read_marks(path: Path | None, record: SceneRecord) -> Marks:
-    """Read the file of a page's marks; None: there are none. Views of photographs become those of their cameras."""
+    """Read the file of a page's marks; None: no marks. Views of photographs become those of their cameras."""
     content = {} if path is None else read_json(path)
     if not isinstance(content, dict) or not set(content) <= set(KEYS) or not all(map(_is_list, content.values())):
         raise InputError(f"{path} is {brief(content)}, but must be an object of lists of objects: {', '.join(KEYS)}.")
@@ -63,7 +63,7 @@ def _require(value: Any, key: str, where: str) -> None:
 
 
 def _camera(name: Any, record: SceneRecord, where: str) -> dict[str, Any]:
-    """Return the camera of a photograph, as the file has it; what it looks at is as far away as the scene's box."""
+    """Return the camera of a photograph in the file's form; it looks at a point as far away as the scene's box."""
     if name not in record.view_names:
         raise InputError(f"{where}: there is no photograph {brief(name)}; the first is {record.view_names[0]!r}.")
     view = record.view_names.index(name)
@@ -71,7 +71,7 @@ def _camera(name: Any, record: SceneRecord, where: str) -> dict[str, Any]:
     eye, back = c2w[:, 3], c2w[:, 2]
     away = torch.clamp((eye - center) @ back, min=0.1 * float((record.aabb[1] - record.aabb[0]).norm()))
     position, look_at = points_to_user(torch.stack([eye, eye - away * back]), record.to_user)
-    # The page's window and films have the shape of the first photograph.
+    # The page's window and films have the aspect ratio of the first photograph.
     shape = float(record.cameras.width[0] / record.cameras.height[0])
     half = 0.5 * shape * float(record.cameras.height[view] / record.cameras.focal[view, 1])
     return {

@@ -1,7 +1,7 @@
-"""Splats to the screen and gradients back, for the CPU: `gaussians.project` and `gaussians.colors`, fused.
+"""Project splats to the screen and gradients back, on the CPU: `gaussians.project` and `gaussians.colors`, fused.
 
-A row of `screen` is one splat: mean (x, y), conic (a, b, c), opacity, color, half width and half height of the box
-that it is visible in (pixels), and depth, which is 0 for splats that are not drawn. Gradients on the screen have its
+A row of `screen` is one splat: mean (x, y), conic (a, b, c), opacity, color, half width and half height of the box in
+which it is visible (pixels), and depth, which is 0 for splats that are not drawn. Gradients on the screen have its
 first nine columns.
 """
 
@@ -18,7 +18,7 @@ COLUMNS = 12
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, REACH_X, REACH_Y, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11
 DILATED, VISIBLE = np.float32(DILATION), np.float32(LEAST_ALPHA)
 ONE, TWO, HALF, ZERO = np.float32(1.0), np.float32(2.0), np.float32(0.5), np.float32(0.0)
-FAR_OFF = np.float32(1e6)  # Pixels; what is larger or farther away is a number that came out wrong.
+FAR_OFF = np.float32(1e6)  # Pixels; larger sizes or distances are numerical errors.
 Y0, Y1 = np.float32(DEGREE_1), np.float32(DEGREE_2)
 Y2, Y3 = np.array(DEGREE_3, np.float32), np.array(DEGREE_4, np.float32)
 
@@ -40,7 +40,7 @@ def project(first, last, splats, camera, screen):
         determinant, opacity = xx * yy - xy * xy, ONE / (ONE + math.exp(-logits[i]))
         if not (determinant > ZERO and opacity > VISIBLE):
             continue
-        cut = TWO * math.log(opacity / VISIBLE)  # where d^T conic d is that, alpha is just visible
+        cut = TWO * math.log(opacity / VISIBLE)  # the value of d^T conic d at which alpha is just visible
         mean_x, mean_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         reach_x, reach_y = math.sqrt(cut * xx), math.sqrt(cut * yy)
         if not (abs(mean_x) + reach_x < FAR_OFF and abs(mean_y) + reach_y < FAR_OFF):
@@ -171,7 +171,7 @@ def _axes_back(quaternions, log_scales, i, r, to_m, to_scales, to_quaternions):
         s = math.exp(log_scales[i, k])
         to_scales[i, k] = s * (r[0, k] * to_m[0, k] + r[1, k] * to_m[1, k] + r[2, k] * to_m[2, k])
         for j in range(3):
-            to_m[j, k] *= s  # now of R
+            to_m[j, k] *= s  # now the gradient of R
     w, x, y, z, length = _unit(quaternions, i)
     g = to_m
     of_w = TWO * (z * (g[1, 0] - g[0, 1]) + y * (g[0, 2] - g[2, 0]) + x * (g[2, 1] - g[1, 2]))
@@ -181,7 +181,7 @@ def _axes_back(quaternions, log_scales, i, r, to_m, to_scales, to_quaternions):
     of_x -= TWO * TWO * x * (g[1, 1] + g[2, 2])
     of_y -= TWO * TWO * y * (g[0, 0] + g[2, 2])
     of_z -= TWO * TWO * z * (g[0, 0] + g[1, 1])
-    along = w * of_w + x * of_x + y * of_y + z * of_z  # the length of a quaternion changes nothing
+    along = w * of_w + x * of_x + y * of_y + z * of_z  # the length of a quaternion has no effect
     to_quaternions[i, 0], to_quaternions[i, 1] = (of_w - w * along) / length, (of_x - x * along) / length
     to_quaternions[i, 2], to_quaternions[i, 3] = (of_y - y * along) / length, (of_z - z * along) / length
 
@@ -209,7 +209,7 @@ def _local_back(x, y, z, rotation, lens, g, to_t, to_mean):
 @njit
 @no_type_check
 def _harmonics(means, i, eye, count, basis):
-    # As `SphericalHarmonicsEncoder` has them, where there are so many beside the first.
+    # As in `SphericalHarmonicsEncoder`, if there are `count` besides the first.
     x, y, z = means[i, 0] - eye[0], means[i, 1] - eye[1], means[i, 2] - eye[2]
     length = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / length, y / length, z / length
@@ -230,7 +230,7 @@ def _harmonics(means, i, eye, count, basis):
 
 
 def trial() -> None:
-    """Compile the kernels for splats of every degree; it raises whatever the compiler raises."""
+    """Compile the kernels for splats of every degree; errors of the compiler propagate."""
     from nerf_lightning.extensions.splats.rasterizer import try_kernels
 
     try_kernels()

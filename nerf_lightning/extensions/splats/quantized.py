@@ -1,8 +1,8 @@
 """Splats as bytes of a page, a tenth of a PLY.
 
-Planes of bytes of one kind each, so that gzip finds like next to like: means as floats without their last byte,
-logarithms of standard deviations, unit quaternions, opacity, colors of degree 0, and the other harmonics.
-`page_files/splats.js` reads them.
+Each plane has bytes of one kind, so that gzip compresses them well: means as floats without their last byte, logarithms
+of standard deviations, unit quaternions, opacity, colors of degree 0, and the other harmonics. `page_files/splats.js`
+reads them.
 """
 
 import gzip
@@ -19,30 +19,30 @@ from torch.nn.functional import normalize
 from nerf_lightning.extensions.splats.gaussians import Gaussians, dc_of_color
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1
 
-MOST_NATS = 12.0  # Between the largest and the smallest standard deviation: smaller ones are no wider than a pixel.
+MOST_NATS = 12.0  # Between the largest and the smallest standard deviation: smaller ones are narrower than a pixel.
 COLORS = (-0.5, 1.5)
-RARE = 0.001  # So large a share of the harmonics is clipped.
-COARSE = 4  # Steps of a byte that one step of a harmonic takes: gzip makes half of them.
+RARE = 0.001  # Share of the harmonics that is clipped.
+COARSE = 4  # Byte steps per step of a harmonic: gzip halves their size.
 LARGEST = 127 // COARSE * COARSE
 
 
 @dataclass(frozen=True)
 class QuantizedSplats:
-    """Bytes, and what they mean."""
+    """Bytes and their scales."""
 
     splats: int
     degree: int
     scales: tuple[float, float]
-    """What bytes 0 and 255 of the logarithms of standard deviations stand for,"""
+    """Values of bytes 0 and 255 of the logarithms of standard deviations,"""
     colors: tuple[float, float]
     """those of colors,"""
     harmonics: float
-    """and 128 + `LARGEST` of the other harmonics, of which 128 is 0."""
+    """and of 128 + `LARGEST` of the other harmonics, of which 128 is 0."""
     content: UInt8[ndarray, "planes splats"]
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> "QuantizedSplats":
-        """Round splats whose numbers are finite."""
+        """Quantize splats with finite numbers."""
         largest = float(gaussians.log_scales.max())
         scales = max(float(gaussians.log_scales.min()), largest - MOST_NATS), largest
         rest = gaussians.sh_rest.flatten(1).numpy()
@@ -62,11 +62,11 @@ class QuantizedSplats:
         return cls(len(gaussians), gaussians.sh_degree, scales, COLORS, harmonics, content)
 
     def described(self) -> dict[str, Any]:
-        """Return what a page has to know beside the bytes."""
+        """Return what a page needs besides the bytes."""
         return {name: value for name, value in asdict(self).items() if name != "content"}
 
     def packed(self) -> bytes:
-        """Return the bytes by gzip."""
+        """Return the bytes compressed by gzip."""
         return gzip.compress(self.content.tobytes(), compresslevel=9, mtime=0)
 
     def gaussians(self) -> Gaussians:

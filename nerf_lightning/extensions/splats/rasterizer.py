@@ -1,7 +1,7 @@
 """The rasterizer of `reference`, fast on the CPU: numba kernels on every core, forward and backward, in float32.
 
-The result is a function of the input alone: tiles are shared out over threads, and their gradients of a splat are
-added in a fixed order.
+The result is deterministic: tiles are distributed over threads, and their gradients of a splat are added in a fixed
+order.
 """
 
 from typing import Any
@@ -28,13 +28,13 @@ def rasterize(
     background: Float[Tensor, "3"],
     on_screen: Float[Tensor, "n 2"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return what the camera sees (`reference.rasterize`), with gradients for every tensor of the splats.
+    """Render the camera's view (`reference.rasterize`), with gradients for every tensor of the splats.
 
     Args:
         gaussians: float32, on the CPU. A splat with a number that is not finite is not drawn.
-        camera: where from.
+        camera: the camera to render.
         background: color behind the splats.
-        on_screen: zeros that require a gradient: they get that of each splat's mean on the screen (per pixel).
+        on_screen: zeros that require a gradient: they receive that of each splat's mean on the screen (per pixel).
     """
     picture: Tensor = _Rasterize.apply(*gaussians.tensors().values(), on_screen, camera, background)
     return picture
@@ -81,14 +81,14 @@ def _over_tiles(kernel: Any, count: int, *arrays: Any) -> None:
 
 
 def _arrays(camera: Pinhole) -> tuple[ndarray, ndarray, ndarray]:
-    """Return what kernels take of a camera: rotation, eye, and f, c, limits of x / z and y / z, near, size."""
+    """Return a camera's parameters for kernels: rotation, eye, and f, c, limits of x / z and y / z, near, size."""
     lens = (*camera.focal, *camera.center, *jacobian_limits(camera), camera.near, camera.width, camera.height)
     rotation, eye = (each.detach().float().contiguous().numpy() for each in (camera.rotation, camera.eye))
     return rotation, eye, np.array(lens, np.float32)
 
 
 def try_kernels() -> None:
-    """Draw one splat, and go back."""
+    """Run a forward and a backward pass of one splat."""
     mean, turn, one = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3)
     gaussians = Gaussians(mean, -2 * one, turn, torch.zeros(1), one.clone(), torch.ones(1, 3, 3))
     gaussians = gaussians.map(lambda each: each.requires_grad_())

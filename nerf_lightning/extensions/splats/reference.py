@@ -16,7 +16,7 @@ from nerf_lightning.extensions.splats.gaussians import (
 
 
 def rasterize(gaussians: Gaussians, camera: Pinhole, background: Float[Tensor, "3"]) -> Float[Tensor, "height width 3"]:
-    """Return what the camera sees: sum of T_i alpha_i c_i, nearest splat first (Eq. 3, arXiv 2308.04079).
+    """Render the camera's view: sum of T_i alpha_i c_i, nearest splat first (Eq. 3, arXiv 2308.04079).
 
     alpha = min(0.99, opacity exp(-d^T conic d / 2)) for d from the splat's mean on the screen to the pixel's center.
     """

@@ -1,7 +1,7 @@
-"""Splats into pixels and gradients back, for the CPU: tiles of 16 x 16 pixels, each of which one thread takes.
+"""Blend splats into pixels and propagate gradients back, on the CPU: one thread per tile of 16 x 16 pixels.
 
-Within a tile the splats are gone through once, nearest first, and of each only the rows that it is visible in: 16
-pixels at a time, which stand in the cache with the light that is left for each.
+Within a tile, splats are processed once, nearest first, and only in the rows where each is visible: 16 pixels at a
+time, which stay in the cache with their remaining light.
 """
 
 import math
@@ -28,21 +28,21 @@ from nerf_lightning.extensions.splats.projection import (
 
 SIDE = 16
 AREA = SIDE * SIDE
-LOOK = 16  # After so many splats a tile looks whether it is opaque.
+LOOK = 16  # Number of splats after which a tile checks whether it is opaque.
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LEAST, LARGEST, DARK = np.float32(LEAST_ALPHA), np.float32(LARGEST_ALPHA), np.float32(LEAST_LIGHT)
-# exp(-8 u) = p(u)^8 for u in [0, 1], to 2e-7: a polynomial makes vectors, the library's function does not.
+# exp(-8 u) = p(u)^8 for u in [0, 1], to 2e-7: a polynomial vectorizes, the library's function does not.
 U1, U2, U3, U4 = (np.uint64(part * AREA) for part in range(1, 5))
 EIGHTH, FARTHEST = np.float32(0.125), np.float32(8.0)
 P = np.polynomial.Chebyshev.interpolate(lambda u: np.exp(-u), 7, (0, 1)).convert(kind=np.polynomial.Polynomial).coef
 P0, P1, P2, P3, P4, P5, P6, P7 = (np.float32(each) for each in P)
-FAST = {"contract", "reassoc", "arcp"}  # NaN stays what it is: not drawn.
+FAST = {"contract", "reassoc", "arcp"}  # NaN keeps its meaning: not drawn.
 
 
 def nearest_first(screen: Float[ndarray, "n 12"]) -> Int[ndarray, "drawn"]:
-    """Return the numbers of the splats that are drawn, by depth; of equally deep ones the first comes first."""
+    """Return the indices of the drawn splats, sorted stably by depth."""
     drawn = np.flatnonzero(screen[:, DEPTH] > 0)
-    # Positive floats are in the order of their bits: one sort of integers, and no ties.
+    # Positive floats sort like their bits: one sort of integers, without ties.
     keys = screen[drawn, DEPTH].view(np.uint32).astype(np.uint64) << np.uint64(32) | drawn.astype(np.uint64)
     return (np.sort(keys) & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
@@ -58,7 +58,7 @@ def _tiles_of(row, across, down):
 @njit(nogil=True, cache=True)
 @no_type_check
 def sort_into_tiles(order, screen, across, down):
-    """Return the splats of each tile in order, one tile after the other, and where each begins."""
+    """Return the splats of each tile in order, tile by tile, and the start of each tile."""
     starts = np.zeros(across * down + 1, np.int64)
     for i in order:
         left, right, top, bottom = _tiles_of(screen[i], across, down)
@@ -79,7 +79,7 @@ def sort_into_tiles(order, screen, across, down):
 @njit(inline="always")
 @no_type_check
 def _exp_minus(s):
-    # s is at least 0; from 8 on, where no alpha is visible, it is exp(-8).
+    # s is at least 0; beyond 8, where no alpha is visible, the result is exp(-8).
     u = min(max(s, ZERO), FARTHEST) * EIGHTH
     p = P0 + u * (P1 + u * (P2 + u * (P3 + u * (P4 + u * (P5 + u * (P6 + u * P7))))))
     p = p * p
@@ -99,7 +99,7 @@ def _is_dark(light):
 @njit
 @no_type_check
 def _splat(row, x0, y0):
-    # A splat as a tile sees it: mean, conic, opacity, color, and the rows of pixels that it is visible in.
+    # A splat relative to a tile: mean, conic, opacity, color, and the rows of pixels in which it is visible.
     mean_x, mean_y = row[MEAN_X] - np.float32(x0) - HALF, row[MEAN_Y] - np.float32(y0) - HALF
     top, bottom = max(math.ceil(mean_y - row[REACH_Y]), 0), min(math.floor(mean_y + row[REACH_Y]), SIDE - 1)
     shape = mean_x, mean_y, row[CONIC_A], row[CONIC_B], row[CONIC_C]
@@ -109,8 +109,8 @@ def _splat(row, x0, y0):
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
 @no_type_check
 def blend(first, last, across, screen, splats, starts, background, picture):
-    """Fill the pixels of some tiles; the picture has whole tiles."""
-    # Light that is left, and the three colors. One array, so that LLVM knows that its parts lie apart.
+    """Fill the pixels of some tiles; the picture consists of whole tiles."""
+    # Remaining light, and the three colors. One array, so that LLVM knows that its parts do not alias.
     px = np.empty(4 * AREA, np.float32)
     for tile in range(first, last):
         x0, y0 = tile % across * SIDE, tile // across * SIDE
@@ -143,10 +143,10 @@ def blend_back(first, last, across, screen, splats, starts, picture, gradient, p
     """Fill the gradient of each splat in each of some tiles: rows of `parts`, the first nine columns of the screen's.
 
     With g the gradient of a pixel and C its color: dL/dalpha_i = T_i c_i.g - R_i.g / (1 - alpha_i), where
-    R_i = C - sum over j <= i of T_j alpha_j c_j is what lies behind. Nearest first again, so that the light is to the
-    bit what it was.
+    R_i = C - sum over j <= i of T_j alpha_j c_j is what is behind. Nearest first again, so that the light is the same,
+    bit for bit.
     """
-    # Light that is left, R.g, and the gradient's three colors.
+    # Remaining light, R.g, and the gradient's three colors.
     px = np.empty(5 * AREA, np.float32)
     for tile in range(first, last):
         x0, y0 = tile % across * SIDE, tile // across * SIDE
@@ -212,7 +212,7 @@ def add_parts(splats, parts, on_screen):
 
 
 def trial() -> None:
-    """Compile the kernels; it raises whatever the compiler raises."""
+    """Compile the kernels; errors of the compiler propagate."""
     from nerf_lightning.extensions.splats.rasterizer import try_kernels
 
     try_kernels()

@@ -1,4 +1,4 @@
-"""The pictures that splats are fitted to and judged by: photographs, or what the field renders, through pinholes."""
+"""Pictures for fitting and evaluating splats: photographs or renders of the field, through pinholes."""
 
 from dataclasses import dataclass, replace
 
@@ -34,21 +34,20 @@ class View:
 
 
 def color_behind(background: Background) -> Float[Tensor, "3"]:
-    """Return what is shown behind splats; black where a closed ray has nothing behind it."""
+    """Return the color behind splats; black if closed rays have nothing behind them."""
     shown = background_colors(background, 1, torch.device("cpu"), random=None)
     return torch.zeros(3) if shown is None else shown[0]
 
 
 def without_lens(cameras: Cameras, longest: int) -> Cameras:
-    """Return pinholes of the same focal lengths, for pictures whose longer side has at most `longest` pixels."""
+    """Return pinholes with the same focal lengths, for pictures whose longer side has at most `longest` pixels."""
     return replace(at_most(cameras, longest), lens=torch.zeros_like(cameras.lens), lens_model="pinhole")
 
 
 def photographed(scene: Scene, view: int, pinholes: Cameras) -> View:
-    """Return a photograph as a pinhole would have taken it: resampled where its lens bends rays, or where it is larger.
+    """Return a photograph as taken by a pinhole: resampled if its lens distorts, or if it is larger.
 
-    Viewers draw splats through pinholes. Pixels that the photograph does not show, or that its mask leaves out, do not
-    count.
+    Viewers draw splats through pinholes. Pixels outside the photograph or its mask do not count.
     """
     rgba, kept = scene.pixels.view(view), scene.pixels.kept(view)
     camera = Pinhole.of(pinholes, view, float(scene.near[view]))
@@ -57,7 +56,7 @@ def photographed(scene: Scene, view: int, pinholes: Cameras) -> View:
         return View(camera, rgba, kept)
     flat = rgba.movedim(-1, 0)[None].float() / 255.0
     mask = torch.ones_like(flat[:, :1]) if kept is None else kept[None, None].float()
-    planes = torch.cat([flat[:, :3] * flat[:, 3:], flat[:, 3:], mask], dim=1)  # premultiplied, as what is averaged is
+    planes = torch.cat([flat[:, :3] * flat[:, 3:], flat[:, 3:], mask], dim=1)  # premultiplied for averaging
     if rgba.shape[:2] != (height, width):
         planes = interpolate(planes, (height, width), mode="area")
     if scene.cameras.lens_model != "pinhole":
@@ -69,7 +68,7 @@ def photographed(scene: Scene, view: int, pinholes: Cameras) -> View:
 
 
 def _seen_through(cameras: Cameras, pinholes: Cameras, view: int) -> Float[Tensor, "height width 2"]:
-    """Return where the lens shows what the pinhole's pixels see, from -1 to 1 over the photograph."""
+    """Return the places in the photograph, from -1 to 1, of what the pinhole's pixels see."""
     pixels = all_pixels(pinholes, view)
     plane = (torch.stack([pixels.x, pixels.y], dim=-1) + 0.5 - pinholes.center[view]) / pinholes.focal[view]
     bent = project_plane(
@@ -82,6 +81,6 @@ def _seen_through(cameras: Cameras, pinholes: Cameras, view: int) -> Float[Tenso
 def rendered(
     model: Model, record: SceneRecord, pinholes: Cameras, view: int, tile_points: int, background: Background
 ) -> Picture:
-    """Return what the field shows a pinhole."""
+    """Render the field through a pinhole."""
     rays_of = RayGenerator(pinholes, record.near, record.far, names_photographs=model.needs_photographs)
     return render_picture(model, rays_of, view, background, tile_points)

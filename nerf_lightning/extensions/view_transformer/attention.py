@@ -1,6 +1,6 @@
 """The two attentions of a view transformer: over the views of a point, and over the points of a ray.
 
-GNT (arXiv 2207.13298). Letters: q the state of a point, x what it looks like in a view, p how that view looks on it.
+GNT (arXiv 2207.13298). Letters: q the state of a point, x its appearance in a view, p that view's direction to it.
 """
 
 from typing import Any
@@ -13,15 +13,15 @@ from torch.nn import functional
 from nerf_lightning.nerf.matmul_precision import Linear, disable_autocast
 
 NARROWER = 8
-"""The weights of views come out of a layer so many times narrower than the states."""
+"""Factor by which the hidden layer of the views' weights is narrower than the states."""
 
 
 class ViewAttention(nn.Module):
     """q + W sum_v softmax_v(MLP(k_v - q + p_v)) (x_v + p_v), over the views that see the point.
 
     Subtraction instead of products, channel by channel (Point Transformer, arXiv 2012.09164). Keys, queries and
-    positions meet in the first layer of the MLP alone, so each is led into it directly: the same functions, at a
-    fraction of the arithmetic. What no view sees keeps its state.
+    positions meet only in the first layer of the MLP, so each is projected into it directly: the same functions, at a
+    fraction of the arithmetic. Points that no view sees keep their state.
 
     Args:
         width: of the states.
@@ -33,7 +33,7 @@ class ViewAttention(nn.Module):
         self.norm = nn.LayerNorm(width, eps=1e-6)
         self.query = Linear(width, self.narrow, bias=False)
         self.turn = nn.Sequential(nn.Linear(4, self.narrow), nn.ReLU(inplace=True))
-        # Key and value in one product.
+        # Key and value in one matrix product.
         self.of_view, self.of_turn = Linear(width, self.narrow + width), Linear(self.narrow, self.narrow + width)
         self.weigh, self.out = Linear(self.narrow, width), Linear(width, width)
 
@@ -44,7 +44,7 @@ class ViewAttention(nn.Module):
         turned: Float[Tensor, "rays samples sources 4"],
         visible: Bool[Tensor, "rays samples sources"],
     ) -> Float[Tensor, "rays samples width"]:
-        """Return the states after a look at the views."""
+        """Return the states after attention to the views."""
         known = (self.of_view(views) + self.of_turn(self.turn(turned))).float()
         key, value = known.split([self.narrow, known.shape[-1] - self.narrow], dim=-1)
         query = self.query(self.norm(states))[..., None, :]
@@ -58,14 +58,14 @@ def attend(
     values: Float[Tensor, "*points sources width"],
     visible: Bool[Tensor, "*points sources"],
 ) -> Float[Tensor, "*points width"]:
-    """Return the mean of the visible values, weighted by the softmax of their scores channel by channel; else 0."""
+    """Return the mean of the visible values, weighted by the channel-wise softmax of their scores; 0 if none is."""
     return _Attend.apply(scores, values, visible)
 
 
 class _Attend(torch.autograd.Function):
     """With o = sum_v w_v x_v and its gradient g: dx_v = w_v g and ds_v = w_v g (x_v - o).
 
-    torch's own softmax takes several times as long to go back, where the last axis is not the one that sums to 1.
+    The backward pass of torch's own softmax takes several times as long if the last axis is not the one that sums to 1.
     """
 
     @staticmethod
@@ -92,7 +92,7 @@ class RayAttention(nn.Module):
 
     Args:
         width: of the states.
-        heads: their shares.
+        heads: number of heads.
     """
 
     def __init__(self, width: int, heads: int):
@@ -105,7 +105,7 @@ class RayAttention(nn.Module):
     def forward(
         self, states: Float[Tensor, "rays samples width"], with_weights: bool
     ) -> tuple[Float[Tensor, "rays samples width"], Float[Tensor, "rays samples"] | None]:
-        """Return the states after a look at each other, and if asked how much of all looks goes to each of them."""
+        """Return the states after self-attention, and, if `with_weights`, each one's share of all attention."""
         rays, samples, width = states.shape
         split = self.query_key_value(self.norm(states)).float().view(rays, samples, 3, self.heads, -1)
         query, key, value = split.permute(2, 0, 3, 1, 4)
@@ -119,7 +119,7 @@ class RayAttention(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """Two layers with four times the width between them, added to what comes in.
+    """Two layers with four times the width between them, with a residual connection.
 
     Args:
         width: of the states.
@@ -135,5 +135,5 @@ class FeedForward(nn.Module):
         return states + self.change(self.norm(states))
 
     def change(self, normed: Float[Tensor, "*points width"]) -> Float[Tensor, "*points width"]:
-        """Return what is added to states, of the states normalized."""
+        """Return what is added to the states, given the normalized states."""
         return self.out(functional.relu(self.wide(normed)))

@@ -21,8 +21,8 @@ class Block(nn.Module):
     Args:
         width: of the states.
         heads: heads of the attention along the ray.
-        encoded: whether the encodings of points and directions enter.
-        experts: in the place of the first feed-forward layer; 0: none.
+        encoded: whether to use the encodings of points and directions.
+        experts: number of experts that replace the first feed-forward layer; 0: none.
     """
 
     def __init__(self, width: int, heads: int, encoded: bool, experts: int):
@@ -45,7 +45,7 @@ class Block(nn.Module):
         random: RayRandom | None,
         with_weights: bool,
     ) -> tuple[Float[Tensor, "rays samples width"], Gates | None, Float[Tensor, "rays samples"] | None]:
-        """Return the states; the gates of experts, where there are some; and the weights of samples, where asked."""
+        """Return the states; the gates of the experts, if any; and the weights of samples, if `with_weights`."""
         gates = None
         states = self.over_views(states, views.states, views.turned, views.visible)
         if isinstance(self.after_views, Experts):

@@ -1,7 +1,7 @@
-"""Experts in the place of a feed-forward layer, of which two are asked about each point (GNT-MOVE, ICCV 2023).
+"""Experts in place of a feed-forward layer, two of which are used for each point (GNT-MOVE, ICCV 2023).
 
-All are computed, and the gate multiplies what they give: shapes are fixed, and nothing but torch is needed. Letters: E
-experts, g the gates of a point, of which two are not 0.
+All are computed, and the gate multiplies their outputs: shapes are fixed, and only torch is needed. Letters: E experts,
+g the gates of a point, of which two are not 0.
 """
 
 import math
@@ -21,19 +21,19 @@ CHOSEN = 2
 GATE_DIM = 2
 FIRST_TEMPERATURE, LEAST_TEMPERATURE = 0.5, 0.01
 NEIGHBORS = 4
-"""Rays on which the gates of a ray are to be alike."""
+"""Number of neighboring rays to which a ray's gates should be similar."""
 
 
 @dataclass(frozen=True)
 class Gates(TensorStruct):
-    """How much is asked of each expert about points."""
+    """Weights of the experts at points."""
 
     chosen: Float[Tensor, "*points experts"]
     """Sum to 1; two are not 0."""
     shares: Float[Tensor, "*points experts"]
     """Before the choice: a softmax."""
     load: Float[Tensor, "*points experts"]
-    """How likely each expert is to be among the two, over the noise; without noise whether it is."""
+    """Probability of each expert to be among the two, over the noise; without noise, whether it is."""
 
 
 class Gate(nn.Module):
@@ -52,7 +52,7 @@ class Gate(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw the vectors anew, and set the temperature back; the projection is torch's own to reset."""
+        """Reinitialize the vectors and reset the temperature; torch resets the projection itself."""
         nn.init.normal_(self.vectors)
         nn.init.constant_(self.log_temperature, math.log(FIRST_TEMPERATURE))
 
@@ -62,7 +62,7 @@ class Gate(nn.Module):
 
         Args:
             states: normalized.
-            noise: standard normal numbers; its deviation becomes 1 / E. None: none.
+            noise: standard normal numbers, scaled to a standard deviation of 1 / E. None: no noise.
         """
         cosines = (
             functional.normalize(self.project(states.float()), dim=-1) @ functional.normalize(self.vectors, dim=-1).mT
@@ -76,7 +76,7 @@ class Gate(nn.Module):
         kept = shares * asked
         load = asked
         if noise is not None:
-            # Of the others' noisy scores the second largest, which one's own has to exceed (arXiv 1701.06538).
+            # The second largest of the others' noisy scores, which an expert's own must exceed (arXiv 1701.06538).
             second, third = best.values[..., 1:2], best.values[..., 2:3]
             to_exceed = torch.where(asked > 0, third, second)
             load = torch.special.ndtr((clean - to_exceed) / deviation)
@@ -84,7 +84,7 @@ class Gate(nn.Module):
 
 
 class Experts(nn.Module):
-    """The mean of a feed-forward layer that is always asked and of the two experts that the gate chooses.
+    """The mean of a feed-forward layer that is always used and of the two experts that the gate chooses.
 
     Args:
         width: of the states.
@@ -100,7 +100,7 @@ class Experts(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Set the biases to 0, and give the second layer the size of each expert's own."""
+        """Set the biases to 0, and scale the second layer like each expert's own."""
         nn.init.zeros_(self.out_bias)
         nn.init.uniform_(self.out.weight, -(bound := (self.out.in_features // self.experts) ** -0.5), bound)
 
@@ -130,10 +130,10 @@ def _variation(of_points: Float[Tensor, "*points experts"]) -> Float[Tensor, ""]
 
 
 def roughness(gates: Gates, rays: RayBundle, target: Tensor) -> Float[Tensor, "rays"]:
-    """Return how far the gates of each ray are from those of the nearest rays of its target, sample by sample.
+    """Return the divergence of each ray's gates from those of the nearest rays of its target, sample by sample.
 
-    The Kullback-Leibler divergences KL(neighbor | ray), weighted by the softmax of minus the distances of their
-    directions, in units of the mean distance to the nearest. Samples of one number lie nearest to each other.
+    The Kullback-Leibler divergences KL(neighbor | ray), weighted by the softmax of the negative distances of their
+    directions, in units of the mean distance to the nearest. Samples with the same index are nearest to each other.
     """
     with torch.no_grad():
         apart = torch.cdist(rays.directions, rays.directions)

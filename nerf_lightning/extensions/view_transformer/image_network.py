@@ -1,4 +1,4 @@
-"""Features of photographs: a small convolutional network with skips between its scales."""
+"""Features of photographs: a small convolutional network with skip connections between its scales."""
 
 from typing import Literal
 
@@ -12,19 +12,19 @@ from nerf_lightning.nerf.part import Part
 
 ImageNorm = Literal["none", "instance", "neurn"]
 PATCH = 3
-"""Side in pixels of the squares whose deviation is taken."""
+"""Side in pixels of the squares whose standard deviation is computed."""
 LEAST_DEVIATION = 1e-6
-"""Deviations below it, which only rounding makes of colors in [0, 1], count as none."""
+"""Smaller deviations of colors in [0, 1] are rounding, and count as 0."""
 
 
 def normalized(
     pictures: Float[Tensor, "views 3 height width"], kind: ImageNorm
 ) -> Float[Tensor, "views 3 height width"]:
-    """Return pictures as the image network sees them.
+    """Return normalized pictures for the image network.
 
     Args:
         pictures: colors in [0, 1].
-        kind: `none` shifts them to [-1, 1]; `instance` gives each channel of each picture mean 0 and deviation 1;
+        kind: `none` maps them to [-1, 1]; `instance` gives each channel of each picture mean 0 and deviation 1;
             `neurn` is `local_deviation`.
     """
     if kind == "neurn":
@@ -39,12 +39,12 @@ def local_deviation(
 ) -> Float[Tensor, "*views channels height width"]:
     """Return the standard deviation around each pixel over the picture's largest, channel by channel, in [0, 1].
 
-    NeuRN (arXiv 2505.06894), after neurons that answer to contrast. It is unchanged by gain and offset of a channel,
-    and 0 where all is of one color. Beyond the border the outermost pixels are repeated.
+    NeuRN (arXiv 2505.06894), inspired by neurons that respond to contrast. It is invariant to gain and offset of a
+    channel, and 0 where the color is constant. Borders are padded by replication.
     """
     flat = pictures.reshape(-1, *pictures.shape[-3:])
     around = functional.pad(flat, (patch // 2,) * 4, mode="replicate").unfold(-2, patch, 1).unfold(-2, patch, 1)
-    # Not as a difference of means of squares, which has no digits where little differs.
+    # Not as a difference of means of squares, which loses all digits at low contrast.
     apart = around - around.mean(dim=(-2, -1), keepdim=True)
     deviation = apart.square().mean(dim=(-2, -1)).sqrt()
     deviation = torch.where(deviation > LEAST_DEVIATION, deviation, 0.0)
@@ -55,16 +55,16 @@ def local_deviation(
 class ImageNetwork(Part):
     """Residual blocks at 1/2, 1/4, ... of the picture's size and one scale beyond that of the features, and back.
 
-    The papers' is the first half of a ResNet34 with instance norm (arXiv 2102.13090). Here each scale has as many
-    blocks as the others, and halves the size by a 4 x 4 convolution that is centered between pixels, so that the
-    feature of row i stands at (i + 1/2) `scale` pixels.
+    The papers use the first half of a ResNet34 with instance norm (arXiv 2102.13090). Here all scales have equally many
+    blocks, and halve the size by a 4 x 4 convolution that is centered between pixels, so that the feature of row i is
+    at (i + 1/2) `scale` pixels.
 
     Args:
-        features: channels that come out.
+        features: number of output channels.
         scale: pixels of the picture per feature, along each side: 2, 4 or 8.
-        width: channels at half the size; twice as many at each smaller one.
+        width: channels at half the size; doubled at each smaller one.
         blocks: residual blocks at each size.
-        norm: what is done to the pictures first.
+        norm: normalization of the pictures.
     """
 
     def __init__(self, features: int, scale: int, width: int, blocks: int, norm: ImageNorm):
@@ -80,10 +80,10 @@ class ImageNetwork(Part):
 
     @disable_autocast
     def forward(self, pictures: Float[Tensor, "views 3 height width"]) -> Float[Tensor, "views features rows columns"]:
-        """Return the features of pictures of one size, rows and columns a `scale`th of it, rounded up."""
+        """Return the features of pictures of one size; rows and columns are that size over `scale`, rounded up."""
         height, width = pictures.shape[-2:]
         unit = 2 * self.scale
-        # Of a single feature at the smallest scale no deviation could be taken.
+        # A single feature at the smallest scale has no deviation.
         bottom, right = -height % unit, max(2 * unit, width + -width % unit) - width
         found = functional.pad(normalized(pictures, self.norm), (0, right, 0, bottom), mode="replicate")
         levels: list[Tensor] = []

@@ -1,4 +1,4 @@
-"""A model of no scene in particular: it renders any from its photographs (GNT, ICLR 2023, arXiv 2207.13298)."""
+"""A scene-independent model: it renders any scene from its photographs (GNT, ICLR 2023, arXiv 2207.13298)."""
 
 import logging
 from dataclasses import replace
@@ -28,9 +28,9 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
 from nerf_lightning.nerf.types.scene import DRAWN
 
 DEEP = 8.0
-"""Rays that end so many times as far as they begin are sampled evenly in inverse distance."""
+"""Ratio of a ray's far to near beyond which it is sampled evenly in inverse distance."""
 NEAREST = 1e-3
-"""Share of a ray's end at which its samples begin at least: the inverse of 0 is none."""
+"""Minimum start of a ray's samples as a share of its end: 0 has no inverse."""
 RANGES = {
     "width": (8, 1024),
     "blocks": (1, 64),
@@ -46,7 +46,7 @@ RANGES = {
 }
 
 LEAST_SEEN = 0.5
-"""Of rays that are rendered together: rays past the corners of all photographs are nothing to speak of."""
+"""Minimum share of a render's rays that are seen: a few rays beyond the corners of all photographs are normal."""
 STARTS = {"largest": Largest, "spread": Spread}
 COLORS = {"pooled": PooledColor, "blended": BlendedColor}
 
@@ -54,11 +54,11 @@ log = logging.getLogger(__name__)
 
 
 class ViewTransformer(Model):
-    """Photographs' features at the projections of a ray's points; attention over views, then along the ray; color.
+    """Features of photographs at projections of a ray's points; attention over views, then along the ray; color.
 
-    There is no density and no compositing: the color is read off the points' states, over the background of the
-    photographs. Opacity is 1, and 0 where no source sees the ray. Depth is the mean distance under the attention of the
-    last block. Dropout is left out, so that a run has the same bits again.
+    There is no density and no compositing: the color follows from the points' states, over the background of the
+    photographs. Opacity is 1, or 0 if no source sees the ray. Depth is the mean distance under the attention of the
+    last block. Dropout is omitted, so that runs are reproducible bit for bit.
 
     Args:
         sampler: where along the rays; evenly in inverse distance where a ray ends beyond 8 times its beginning.
@@ -84,7 +84,7 @@ class ViewTransformer(Model):
         smoothness: weight of the smoothness loss: neighboring rays should choose the same experts.
 
     Raises:
-        ValueError: a number out of its range, a width that the heads cannot share.
+        ValueError: a number is out of range, or the width is not divisible by the heads.
     """
 
     needs_photographs = True
@@ -135,14 +135,14 @@ class ViewTransformer(Model):
 
     @property
     def level_names(self) -> tuple[str, ...]:
-        """There is one round."""
+        """There is one level."""
         return ("views",)
 
     def set_source_images(self, photographs: Photographs) -> None:
-        """Take the photographs that rays are rendered from, in the place of earlier ones.
+        """Set the photographs that rays are rendered from, replacing earlier ones.
 
         Raises:
-            InputError: a capture of fewer photographs than views are rendered from, or a random background.
+            InputError: a capture has fewer photographs than views are rendered from, or a random background.
         """
         if photographs.background in DRAWN:
             raise InputError(
@@ -161,12 +161,12 @@ class ViewTransformer(Model):
     def forward(
         self, rays: RayBundle, background: Float[Tensor, "*rays 3"] | None, random: RayRandom | None
     ) -> list[Rendering]:
-        """Render rays from the photographs around them; they lie in one row.
+        """Render a flat batch of rays from the photographs around them.
 
         Args:
-            rays: unit directions, through the world, scene units.
-            background: what is shown where no source sees anything of the ray; None: black.
-            random: the step's numbers for these rays; None for evaluation.
+            rays: unit directions, in the world, scene units.
+            background: the color if no source sees any of the ray; None: black.
+            random: the step's random numbers for these rays; None for evaluation.
 
         Raises:
             InputError: there are no photographs to render from.
@@ -210,12 +210,12 @@ class ViewTransformer(Model):
         ]
 
     def points_per_ray(self, training: bool) -> float:
-        """Return samples times sources: each point is looked at in every view."""
+        """Return samples times sources: each point is looked up in every view."""
         return float(self.sampler.num_samples_after(0) * self.num_sources)
 
     def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator."""
-        for module in reversed(list(self.modules())):  # a part has the last word on those within it
+        """Reinitialize every parameter from torch's generator."""
+        for module in reversed(list(self.modules())):  # a module overrides the initialization of its submodules
             reset = getattr(module, "reset_parameters", None)
             if module is not self and reset is not None:
                 reset()

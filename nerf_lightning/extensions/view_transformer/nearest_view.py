@@ -1,9 +1,9 @@
-"""What photographs give without a model: the nearest one, and a blend of the nearest ones, in the place of a view.
+"""Baselines without a model: the nearest photograph, and a blend of the nearest ones, in place of a view.
 
-A model of many scenes has to be better than that. Both are also looked at through a plane: each ray meets the plane
-through what the cameras look at, across the view's axis, and shows the color of that point in the photographs, as
-light fields are rendered (Levoy and Hanrahan, SIGGRAPH 1996). No depth is known or guessed. The photographs are those
-that the models render from (`source_views.choose_sources`).
+A model of many scenes must be better. Both also exist with a plane: each ray intersects the plane through what the
+cameras look at, perpendicular to the view's axis, and shows the color of that point in the photographs, as in light
+field rendering (Levoy and Hanrahan, SIGGRAPH 1996). No depth is known or estimated. The photographs are those that the
+models render from (`source_views.choose_sources`).
 """
 
 from dataclasses import replace
@@ -31,12 +31,12 @@ KINDS = ("nearest", "blend", "nearest_on_plane", "blend_on_plane")
 
 
 class NearestViews:
-    """The photographs of a scene, to be shown in the place of its views.
+    """The photographs of a scene, to be shown in place of its views.
 
     Args:
-        scene: one capture, or several that were joined.
-        background: what lies behind transparent pixels.
-        count: how many photographs are blended.
+        scene: of one capture, or of several joined ones.
+        background: the color behind transparent pixels.
+        count: the number of photographs to blend.
     """
 
     def __init__(self, scene: Scene, background: Background, count: int):
@@ -47,11 +47,11 @@ class NearestViews:
         )
 
     def pictures(self, view: int) -> dict[str, Float[Tensor, "height width 3"]]:
-        """Return what is shown in the place of a view, for each of `KINDS`."""
+        """Return the pictures shown in place of a view, for each of `KINDS`."""
         photographs, pixels = self.tables.photographs, all_pixels(self.cameras, view)
         shape, rays = pixels.x.shape, self.rays_of(pixels).map(lambda of_picture: of_picture.flatten(0, 1))
         capture = torch.zeros_like(rays.near, dtype=torch.int64) if rays.capture is None else rays.capture
-        # The nearest is the first of one; more come from nearest to farthest.
+        # A single source is the nearest; several are sorted from nearest to farthest.
         sources = choose_sources(photographs, rays, self.count, None)
         views = sources.views[sources.target]
         at = torch.stack([pixels.x, pixels.y], dim=-1).flatten(0, 1) + 0.5
@@ -83,7 +83,7 @@ def _mean(colors: Float[Tensor, "rays sources 3"], weights: Tensor) -> Float[Ten
 
 
 def baselines(scene: Scene, views: list[int], background: Background, count: int) -> dict[str, Any]:
-    """Return the mean PSNR (dB) of each of `KINDS` on views of a scene, each shown by photographs not its own."""
+    """Return the mean PSNR (dB) of each of `KINDS` on views of a scene, each shown by other photographs."""
     nearest = NearestViews(scene, background, count)
     found: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for view in views:

@@ -1,7 +1,7 @@
-"""Where the points along rays appear in other photographs.
+"""Project points along rays into other photographs.
 
 A ray appears as a line (the epipolar line): in the axes of a source camera its point at distance t is a + t b, with a
-the ray's origin and b its direction. So each ray is turned into each camera once, and not each point.
+the ray's origin and b its direction. So each ray is transformed into each camera once, instead of each point.
 """
 
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 LEAST_COSINE = 1e-3
-"""Of the angle from the axis of a pinhole: points beside the camera have no place in its picture."""
+"""Minimum cosine of the angle from a pinhole's axis: points to the side of the camera are not in its picture."""
 BEYOND = 1.1
-"""A lens is believed so far beyond the widest angle that its picture's pixels show; farther out it may fold back."""
+"""Factor beyond the widest angle in a picture up to which its lens is valid; farther out it may fold back."""
 
 
 @dataclass(frozen=True)
 class Projected(TensorStruct):
-    """The points of rays in their source photographs."""
+    """Points of rays in their source photographs."""
 
     at: Float[Tensor, "rays samples sources 2"]
-    """In pixels from the upper left corner (x, y); 0 where it is not visible."""
+    """In pixels from the upper left corner (x, y); 0 if not visible."""
     visible: Bool[Tensor, "rays samples sources"]
-    """Whether the point lies in the picture."""
+    """Whether the point is in the picture."""
     turned: Float[Tensor, "rays samples sources 4"]
-    """How the ray looks on the point against how the source does: the difference of directions, and their dot
+    """The direction of the ray to the point relative to the source's: the difference of directions, and their dot
     product."""
 
 
@@ -44,18 +44,18 @@ def project_samples(
     rays: RayBundle,
     t: Float[Tensor, "rays samples"],
 ) -> Projected:
-    """Return where the points at distances t along rays appear, as `geometry.cameras.project` has it.
+    """Return the projections of the points at distances t along rays, as in `geometry.cameras.project`.
 
     Args:
         cameras: of the photographs.
-        least_cosine: what `seen_cosines` returns of them.
-        views: which of them each ray's sources are.
+        least_cosine: as returned by `seen_cosines`.
+        views: the cameras of each ray's sources.
         rays: in the world.
         t: distances.
     """
     c2w, t = cameras.c2w[views], t[:, :, None, None]
     apart = rays.origins[:, None] - c2w[..., 3]
-    # From a camera's axes (right, up, back) to those of its lens (right, down, forward).
+    # From a camera's axes (right, up, back) to its lens's (right, down, forward).
     axes = torch.cat([c2w[..., :1], -c2w[..., 1:3]], dim=-1)
     start = (apart[..., None, :] @ axes)[..., 0, :]
     along = (rays.directions[:, None, None, :] @ axes)[..., 0, :]
@@ -75,9 +75,9 @@ def project_samples(
 
 @disable_autocast
 def seen_cosines(cameras: Cameras) -> Float[Tensor, "views"]:
-    """Return the cosine of the widest angle from the axis at which each camera's picture shows anything.
+    """Return the cosine of the widest angle from the axis that each camera's picture shows.
 
-    A little more than that of its pixels; of panoramas -1.
+    The angle is slightly wider than that of its pixels; for panoramas the cosine is -1.
     """
     if cameras.lens_model == "pinhole":
         return torch.full_like(cameras.focal[:, 0], LEAST_COSINE)

@@ -1,7 +1,7 @@
-"""Which photographs a ray is rendered from: those taken from nearest to where it is seen from.
+"""Choose the photographs that a ray is rendered from: those taken nearest to its origin.
 
-As IBRNet picks them (arXiv 2102.13090): by direction from the content where cameras stand around it, else by distance.
-In training out of a larger pool, and more or fewer, so that no arrangement is learned by heart.
+As in IBRNet (arXiv 2102.13090): by direction from the content if cameras surround it, else by distance. In training,
+they are drawn from a larger pool, and their number varies, so that no arrangement is memorized.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 POOLS = ((0.2, 1), (0.65, 2), (1.0, 3))
-"""Up to which uniform number the pool is how many times as large as the number of sources (20, 45 and 35 %)."""
+"""Upper bounds of a uniform number, and the pool's size as a multiple of the sources (20, 45 and 35 %)."""
 LARGEST_POOL = 22
 MORE_OR_FEWER = 2
-"""So many sources are added or left out at most in training."""
+"""Maximum number of sources that are added or dropped in training."""
 NO_PHOTOGRAPH = -1
 
 
@@ -30,25 +30,25 @@ class SourceViews(TensorStruct):
     """The photographs that some rays are rendered from; the rays of one target share theirs."""
 
     views: Int[Tensor, "targets sources"]
-    """Which of `Photographs` they are."""
+    """Indices into `Photographs`."""
     given: Bool[Tensor, "targets sources"]
-    """False where there are no more photographs; the place is then that of any."""
+    """False if there are no more photographs; the index is then arbitrary."""
     target: Int[Tensor, "rays"]
-    """Of each ray."""
+    """The target of each ray."""
 
 
 @torch.no_grad()
 def choose_sources(photographs: Photographs, rays: RayBundle, count: int, random: RayRandom | None) -> SourceViews:
-    """Return the photographs that each ray is rendered from; the one that it belongs to itself is never among them.
+    """Return the photographs that each ray is rendered from, never including its own.
 
     Args:
         photographs: on the rays' device.
-        rays: their origins are where the targets were taken from.
+        rays: their origins are the targets' positions.
         count: photographs per target; in training two more or fewer.
-        random: the step's numbers; None takes the nearest.
+        random: the step's random numbers; None takes the nearest.
 
     Raises:
-        InputError: a capture without photographs.
+        InputError: a capture has no photographs.
     """
     capture, photograph, eye, of_ray = _targets(rays)
     distance = squared_distances(
@@ -85,24 +85,24 @@ def squared_distances(
     eye: Float[Tensor, "targets 3"],
     views: Int[Tensor, "#targets views"],
 ) -> Float[Tensor, "targets views"]:
-    """Return how far photographs are from targets, as the nearest are chosen: of directions where cameras stand around.
+    """Return the distances used to choose the nearest photographs: of directions if cameras surround the content.
 
     Args:
         photographs: of all captures.
-        capture: that each target belongs to.
-        eye: where it is seen from.
-        views: which photographs are asked about; of its own capture.
+        capture: of each target.
+        eye: position of each target.
+        views: the photographs to measure, of the target's own capture.
     """
     eyes, middle = photographs.cameras.c2w[views, :, 3], photographs.middle[capture][:, None]
-    # Not by the cosine, which hardly changes where directions all but agree.
+    # Not by the cosine, which hardly changes if directions almost agree.
     turned = functional.normalize(eye[:, None] - middle, dim=-1) - functional.normalize(eyes - middle, dim=-1)
     apart = torch.where(photographs.around[capture][:, None, None], turned, eye[:, None] - eyes)
     return apart.square().sum(dim=-1)
 
 
 def _targets(rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the origins that rays start from, each once (capture, photograph, eye), and which is each ray's."""
-    # Origins are told apart by their bits, as the whole numbers beside them.
+    """Return the unique origins of rays (capture, photograph, eye), and the index of each ray's."""
+    # Origins are compared by their bits, like the integers next to them.
     none = torch.zeros_like(rays.near, dtype=torch.int64)
     capture = none if rays.capture is None else rays.capture
     photograph = none + NO_PHOTOGRAPH if rays.photograph is None else rays.photograph

@@ -1,4 +1,4 @@
-"""Colors and features of photographs in tables of rows, and looking them up between pixels."""
+"""Tables of photographs' colors and features, with interpolated look-up."""
 
 import functools
 import threading
@@ -17,14 +17,14 @@ from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.photographs import Photographs
 
 KEPT_BYTES = 1 << 28
-"""Of colors, and of features, that are kept for the next rays."""
+"""Bytes of colors, and of features, that are cached for the next rays."""
 AT_ONCE = 16
-"""Pictures that go through the image network together."""
+"""Number of pictures that go through the image network together."""
 
 
 @dataclass(frozen=True)
 class ViewTable:
-    """Something at each pixel of some views, of which each may have a size of its own."""
+    """Values at each pixel of some views, which may differ in size."""
 
     rows: Float[Tensor, "rows channels"]
     first: Int[Tensor, "views"]
@@ -37,10 +37,10 @@ class ViewTable:
     def look_up(
         self, view: Int[Tensor, "*#points"], at: Float[Tensor, "*points 2"]
     ) -> Float[Tensor, "*points channels"]:
-        """Return what lies at places in views, between four neighbors; at the border the outermost are repeated.
+        """Return bilinearly interpolated values at places in views; borders are replicated.
 
         Args:
-            view: its number in this table.
+            view: its index in this table.
             at: pixels of the photograph, from its upper left corner (x, y).
         """
         size = self.size[view]
@@ -59,10 +59,10 @@ class ViewTable:
 
 
 class ViewTables:
-    """The tables of photographs, made view by view, and kept as long as they stay the same.
+    """The tables of photographs, made view by view, and cached while they are valid.
 
     Args:
-        photographs: what they are made of.
+        photographs: their source.
     """
 
     def __init__(self, photographs: Photographs):
@@ -72,7 +72,7 @@ class ViewTables:
         self._colors, self._features = _Kept(), _Kept()
 
     def move_to(self, device: torch.device) -> None:
-        """Let all but the pixels lie on a device: copied in each step, the host would wait for it."""
+        """Move everything except the pixels to a device: the host would wait for a copy in each step."""
         self.photographs = self.photographs.to(device)
         self.least_cosine, self.size = self.least_cosine.to(device), self.size.to(device)
 
@@ -80,14 +80,14 @@ class ViewTables:
         """Return the colors of views in [0, 1], over the background of evaluation.
 
         Args:
-            views: which, on the device that these tables were moved to.
+            views: indices, on the device that these tables were moved to.
             numbers: the same, on the host.
         """
         pictures = self._pictures(numbers, views.device)
         return _table([picture.flatten(0, 1) for picture in pictures], self.size[views], 1)
 
     def features(self, views: Int[Tensor, "views"], numbers: Sequence[int], network: ImageNetwork) -> ViewTable:
-        """Return the features of views, given as to `colors`, with gradients where they are asked for."""
+        """Return the features of views, specified as for `colors`, with gradients if they are enabled."""
         device = views.device
         if torch.is_grad_enabled():
             found = self._made(numbers, network, device)
@@ -119,11 +119,11 @@ class ViewTables:
 
 
 class _Kept:
-    # What was made last, up to so many bytes.
+    # A cache of the most recent results, up to `KEPT_BYTES`.
     def __init__(self) -> None:
         self.of: OrderedDict[tuple[int, torch.device], Tensor] = OrderedDict()
         self.state: object = None
-        self.lock = threading.Lock()  # tiles are rendered beside each other
+        self.lock = threading.Lock()  # tiles are rendered in parallel
 
     def get(
         self,
@@ -153,5 +153,5 @@ def _table(of_views: Sequence[Tensor], size: Int[Tensor, "views 2"], scale: int)
 
 
 def _state_of(network: nn.Module) -> object:
-    # Changes whenever a weight is written to, or is another tensor.
+    # Changes whenever a weight is modified or replaced.
     return tuple((weight.data_ptr(), weight._version) for weight in network.parameters())

@@ -1,4 +1,4 @@
-"""What the sources of rays show at their points."""
+"""Features of the sources at the points of rays."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 @dataclass(frozen=True)
 class Views(TensorStruct):
-    """What the sources show at the points of rays."""
+    """Features of the sources at the points of rays."""
 
     states: Float[Tensor, "rays samples sources width"]
     """Color and features together."""
     colors: Float[Tensor, "rays samples sources 3"]
     """In [0, 1]."""
     turned: Float[Tensor, "rays samples sources 4"]
-    """How the ray looks on the point against how the source does (`projection.Projected`)."""
+    """The direction of the ray to the point relative to the source's (`projection.Projected`)."""
     visible: Bool[Tensor, "rays samples sources"]
 
 
 class Largest(nn.Module):
-    """In each channel the largest of what the views show, as published (arXiv 2207.13298); 0 where none sees it.
+    """The maximum over the views in each channel, as published (arXiv 2207.13298); 0 if no view sees the point.
 
     Args:
         width: of the states.
@@ -42,9 +42,9 @@ class Largest(nn.Module):
 
 
 class Spread(Largest):
-    """And a linear layer on the mean and the deviation of the views' colors, and on the variance of their states.
+    """`Largest`, plus a linear layer on the mean and deviation of the views' colors and the variance of their states.
 
-    As IBRNet begins (arXiv 2102.13090): where views differ, they do not see the same thing.
+    Like the initial state in IBRNet (arXiv 2102.13090): if views differ, they do not see the same thing.
 
     Args:
         width: of the states.
@@ -67,7 +67,7 @@ class Spread(Largest):
 def moments(
     values: Float[Tensor, "*points sources channels"], share: Float[Tensor, "*points sources"]
 ) -> tuple[Float[Tensor, "*points channels"], Float[Tensor, "*points channels"]]:
-    """Return the mean of values over the sources, and their variance; 0 where the shares are."""
+    """Return the mean of values over the sources, and their variance; 0 where the shares are 0."""
     share = share[..., None]
     mean = (share * values).sum(dim=-2)
     return mean, (share * (values - mean[..., None, :]).square()).sum(dim=-2)
@@ -88,16 +88,16 @@ class PooledColor(nn.Module):
     def forward(
         self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
-        """Return colors, and the weights of samples as they were given: those of the last attention."""
+        """Return colors, and the given weights of samples, which are those of the last attention."""
         return self.color(self.norm(states.float()).mean(dim=1)), weights
 
 
 class BlendedColor(nn.Module):
-    """sum_s a_s sum_v b_sv c_sv, the sources' own colors, and what the pooled state adds to them.
+    """sum_s a_s sum_v b_sv c_sv of the sources' own colors, plus a correction from the pooled state.
 
-    a is a softmax along the ray, over the points that any source sees, b one over the sources of a point, as IBRNet
-    blends (arXiv 2102.13090). It begins as the mean of all colors that a ray's points have in the sources, and has to
-    learn where they agree, but not what colors are.
+    a is a softmax along the ray, over the points that any source sees, and b one over the sources of a point, as in
+    IBRNet (arXiv 2102.13090). It begins as the mean of all colors of a ray's points in the sources, and must learn
+    where they agree, but not what colors are.
 
     Args:
         width: of the states.
@@ -113,7 +113,7 @@ class BlendedColor(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Begin with nothing added to the sources' colors."""
+        """Begin with a correction of 0."""
         nn.init.zeros_(self.color.weight)
         nn.init.zeros_(self.color.bias)
 

@@ -1,4 +1,4 @@
-"""What a person wants to see: a place to look from, in a window of some size; and the cameras that show it."""
+"""What the user wants to see: a viewpoint in a window of some size, and the cameras that show it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,25 +17,25 @@ from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """One wish of a person; a new wish is a new object."""
+    """One requested look of a user; a new request is a new object."""
 
     c2w: Float[Tensor, "3 4"]
     """Camera to world, columns right, up, back, center; the model's frame."""
     fov: float
     """Vertical field of view in radians."""
     width: int
-    """The window in pixels."""
+    """Size of the window in pixels."""
     height: int
     crop: CropBox | None = None
-    """Only what lies in this box is shown; None: all."""
+    """Only content in this box is shown; None: everything."""
     photograph: int | None = None
-    """Look through the camera of this view, lens included, with its picture in the middle of the window."""
+    """Look through the camera of this view, including its lens, with its picture centered in the window."""
 
 
 def fov_that_holds(fov: float, shape: float, window: float) -> float:
-    """Return the vertical field of view (radians) at which a window shows a photograph of another to its edges.
+    """Return the vertical field of view (radians) at which a window shows all of a photograph with field of view `fov`.
 
-    `shape` is the photograph's width over its height, `window` that of the window.
+    `shape` is the photograph's width over its height, `window` the window's.
 
     >>> round(fov_that_holds(1.0, 1.5, 2.0), 3), round(fov_that_holds(math.pi / 2, 2.0, 1.0), 3)
     (1.0, 2.214)
@@ -44,7 +44,7 @@ def fov_that_holds(fov: float, shape: float, window: float) -> float:
 
 
 def fov_held_by(fov: float, shape: float, window: float) -> float:
-    """Return the vertical field of view of pictures of this shape that a window of this field shows to their edges.
+    """Return the vertical field of view of a picture of this shape that just fits a window with this field of view.
 
     >>> round(fov_held_by(fov_that_holds(0.7, 2.0, 1.0), 2.0, 1.0), 3)
     0.7
@@ -63,14 +63,14 @@ def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Ten
 
 
 def quaternion_of(c2w: Tensor) -> np.ndarray:
-    """Return the rotation of a pose as viser wants it: w, x, y, z for the axes right, down, forward."""
+    """Return the rotation of a pose in viser's form: w, x, y, z for the axes right, down, forward."""
     return quaternion_from_rotation(flip_yz(c2w)[:, :3].double()).numpy()
 
 
 def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:
-    """Return one camera for a picture of about this height, and its near and far.
+    """Return a camera for a picture of about this height, with its near and far.
 
-    A photograph's camera keeps the photograph's shape, and fits into the window.
+    A photograph's camera keeps its aspect ratio, and fits into the window.
     """
     if look.photograph is not None:
         view = slice(look.photograph, look.photograph + 1)

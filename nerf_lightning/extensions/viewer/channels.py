@@ -1,4 +1,4 @@
-"""A view as a picture: one of its channels, or truth and render side by side; and the depth that hides lines."""
+"""A view as a picture: one of its channels, or truth and render side by side; and the depth that occludes lines."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,16 +17,16 @@ from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, vi
 
 COLOR = "color"
 PAPER, LINE = 237, 255
-# Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
+# Depths are sent losslessly with every picture: more pixels per side take time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
-FARTHEST = 167.0  # viser sends depths as whole numbers of 1e-5 in three bytes: what is farther cannot be told.
+FARTHEST = 167.0  # viser sends depths as multiples of 1e-5 in three bytes: this is the maximum.
 
 
 def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
     """Return a channel of a view as a picture.
 
-    Depth is bright where it is near, over the range of what this view shows; normals are in the model's axes, each from
-    -1 to 1 as red, green and blue. What light passes through fades to pale gray.
+    Near depths are bright, over the range in this view; normals are in the model's axes, each from -1 to 1 as red,
+    green and blue. Transparent parts fade to pale gray.
     """
     return to_bytes(CHANNELS[channel](view))
 
@@ -71,7 +71,7 @@ def wiped(
 
 
 def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[Tensor, "taller wider 3"]:
-    """Return the picture in the middle of paper whose width over height is `aspect`.
+    """Return the picture centered on a background whose width over height is `aspect`.
 
     >>> in_window(torch.zeros(2, 2, 3).byte(), 2.0).shape
     torch.Size([2, 4, 3])
@@ -84,9 +84,9 @@ def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[
 
 
 def planar_depth(view: View) -> Float[np.ndarray, "height width"]:
-    """Return how far along the camera's axis each pixel's content lies (scene units), at most 320 pixels a side.
+    """Return the depth along the camera's axis of each pixel's content (scene units), at most 320 pixels per side.
 
-    What light passes through, for more than half, hides nothing: it lies at `FARTHEST`.
+    Pixels that are less than half opaque occlude nothing: their depth is `FARTHEST`.
     """
     step = max(1, -(-max(view.depth.shape) // MOST_DEPTH_SIDE))
     inner = slice(step // 2, None, step)

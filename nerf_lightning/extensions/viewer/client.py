@@ -1,4 +1,4 @@
-"""One person in front of the page: where they look from, what they see, and what is sent to them."""
+"""One user of the page: their viewpoint, what they see, and what is sent to them."""
 
 import threading
 from collections.abc import Callable
@@ -17,20 +17,20 @@ from nerf_lightning.extensions.viewer.shown_photographs import Photographs
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
 
-MOST_SIDE = 4096  # A window counts as no wider and no higher than this (pixels).
-QUALITY = 90  # Of JPEG; a coarse picture is small at any quality.
-# Cameras lie this many times as far as the photographs were taken, at most: where depths cannot be told so far, nothing
-# is hidden.
+MOST_SIDE = 4096  # Maximum width and height of a window (pixels); larger ones count as this.
+QUALITY = 90  # JPEG quality; a coarse picture is small at any quality.
+# Cameras are at most this many times the photographs' distance away: if depths cannot represent that, nothing is
+# occluded.
 FARTHER = 4
-# Who stands this near (share of the photographs' distance) to a photograph's place, looking the same way, is there.
+# A viewpoint this near (share of the photographs' distance) to a photograph's, with the same direction, counts as it.
 NEAR, SAME_WAY = 2e-3, 1 - 1e-5
 
 
 class ViewerClient:
-    """Turn the movements of viser's camera into looks, and views into what the page shows.
+    """Convert movements of viser's camera to looks, and views to what the page shows.
 
-    viser calls from threads of its own; pictures come from the thread that renders, the finest `most_height` pixels
-    high.
+    viser calls this from its own threads; pictures come from the rendering thread, the finest with a height of
+    `most_height` pixels.
     """
 
     def __init__(self, client: Any, queue: RenderQueue, photographs: Photographs, around: PathFrame, most_height: int):
@@ -39,9 +39,9 @@ class ViewerClient:
         self.channel, self.split = COLOR, 0.5
         self.crop: CropBox | None = None
         self.photograph: int | None = None
-        """The view whose camera is looked through."""
+        """The view whose camera is used."""
         self.on_picture: Callable[[int, int, bool], None] = lambda height, width, finest: None
-        """Called after a picture was sent, with its size, and whether it is the finest."""
+        """Called after a picture is sent, with its size, and whether it is the finest."""
         self.on_finest: Callable[[], None] = lambda: None
         self.on_leave: Callable[[], None] = lambda: None
         self.on_move: Callable[[], None] = lambda: None
@@ -50,21 +50,21 @@ class ViewerClient:
         self._arrived = False
         self._seen: tuple[View, CameraState] | None = None
         self.picture: UInt8[Tensor, "height width 3"] | None = None
-        """What was sent last."""
+        """What was last sent."""
         self._wants_present, self._presenting = False, threading.Lock()
         self._looking = threading.RLock()
 
     def start(self) -> None:
-        """Follow the camera from now on; there is a picture at once."""
+        """Follow the camera from now on, and show a picture at once."""
         self.client.camera.on_update(self.queue.errors.harmless(lambda _: self.look()))
         self.look()
         self.queue.add(self.client.client_id, self.refinement)
 
     def look(self) -> None:
-        """Wish for what the camera sees now."""
+        """Request the camera's present view."""
         camera = self.client.camera
         self.on_move()
-        with self._looking:  # else a thread that read the camera before it moved could have the last word
+        with self._looking:  # otherwise a thread that read the camera before it moved could win
             self._notice_leaving()
             width, height = (min(max(1, int(side)), MOST_SIDE) for side in (camera.image_width, camera.image_height))
             self.refinement.ask(CameraState(self.pose(), float(camera.fov), width, height, self.crop, self.photograph))
@@ -76,7 +76,7 @@ class ViewerClient:
         return pose_of(torch.tensor(camera.wxyz).float(), torch.tensor(camera.position).float())
 
     def go(self, c2w: Float[Tensor, "3 4"], fov: float) -> None:
-        """Take the person's camera there; the window shows all of a picture of this vertical field (radians)."""
+        """Move the user's camera there; the window shows all of a picture with this vertical field (radians)."""
         camera, shape = self.client.camera, self.around.width / self.around.height
         with self.client.atomic():
             camera.position = c2w[:, 3].double().numpy()
@@ -84,11 +84,11 @@ class ViewerClient:
             camera.fov = fov_that_holds(fov, shape, camera.aspect)
 
     def level(self) -> None:
-        """Let the person's camera turn about the capture's up again, after it has been taken elsewhere."""
+        """Let the user's camera orbit around the capture's up again, after it has been moved."""
         self.client.camera.up_direction = self.around.up.double().numpy()
 
     def is_here(self) -> bool:
-        """Return whether the person has not left."""
+        """Return whether the user is still connected."""
         return self.queue.serves(self.client.client_id)
 
     def enter(self, view: int) -> None:
@@ -109,9 +109,10 @@ class ViewerClient:
             self.look()
 
     def present(self) -> None:
-        """Send the newest view again, as another channel or with the comparison cut elsewhere.
+        """Send the newest view again, as another channel or with another split of the comparison.
 
-        A slider asks for it more often than it can be done: a thread that finds another one at it leaves it to that.
+        A slider requests this more often than possible: if another thread is already sending, this one leaves it to
+        that.
         """
         self._wants_present = True
         while self._wants_present and self._presenting.acquire(blocking=False):
@@ -123,7 +124,7 @@ class ViewerClient:
                 self._presenting.release()
 
     def draw_over(self, what: str, drawn: bool) -> None:
-        """Say what is drawn over the picture: then its depth is sent too, so that the content hides parts of it."""
+        """Register what is drawn over the picture: its depth is then sent too, so that content occludes the drawing."""
         had = bool(self._drawn_over)
         (self._drawn_over.add if drawn else self._drawn_over.discard)(what)
         if bool(self._drawn_over) != had:

@@ -1,4 +1,4 @@
-"""The panel of the page: what is shown, photographs, the camera path, the crop box, snapshots, exports."""
+"""The panel of the page: channels, photographs, the camera path, the crop box, snapshots, exports."""
 
 import math
 from pathlib import Path
@@ -20,14 +20,14 @@ from nerf_lightning.video.paths.recorded_path import RecordedPath, new_file, tol
 from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
-LEAST_SHARE = 0.01  # The crop box keeps this share of the scene's box along each axis.
+LEAST_SHARE = 0.01  # The crop box keeps at least this share of the scene's box along each axis.
 NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
 
 class Controls:
-    """The panel of one person, who first sees a vertical field of `fov` (radians).
+    """The panel of one user, whose initial vertical field of view is `fov` (radians).
 
-    What they save lies in `folder`; the files of the folder `exports` can be downloaded.
+    Their files are saved in `folder`; the files of the folder `exports` can be downloaded.
     """
 
     def __init__(
@@ -113,13 +113,13 @@ class Controls:
         try:
             with new_file(self.folder, "snapshot", ".png") as path:
                 save_png(path, picture)
-        except OSError as error:  # nothing that is clicked ends a training
+        except OSError as error:  # no click ends a training
             self.session.client.add_notification("Snapshot", told(error), color="red")
         else:
             self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
 
 
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
-    """Return the lower and the upper corner of the box along the user's axes that holds the scene's (user's units)."""
+    """Return the lower and upper corner of the scene's bounding box along the user's axes (user's units)."""
     places = points_to_user(torch.cartesian_prod(*record.aabb.unbind(dim=1)).double(), record.to_user.double())
     return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

@@ -1,4 +1,4 @@
-"""What went wrong for those who look on, as lines in the log."""
+"""Errors of the viewer's users, as lines in the log."""
 
 import functools
 import logging
@@ -11,21 +11,21 @@ MOST_LINES, MOST_LETTERS = 20, 5000
 
 
 class ErrorLog:
-    """Log errors that end one drawing or one click, each once and not too many: they may come with every picture."""
+    """Log errors of one drawing or one click, each once and not too many: they may recur with every picture."""
 
     def __init__(self, log: logging.Logger):
         self.log = log
         self._said: set[str] = set()
 
     def say(self, what: str, error: BaseException) -> None:
-        """Log a line unless it was logged before."""
+        """Log a line unless it was already logged."""
         line = for_terminal(f"{what}: {type(error).__name__}: {error}", MOST_LETTERS)
         if line not in self._said and len(self._said) < MOST_LINES:
             self._said.add(line)
             self.log.warning("%s", line)
 
     def harmless(self, act: Callable[..., None]) -> Callable[..., None]:
-        """Return an act for viser to call, whose errors are a line here in place of viser's traceback."""
+        """Wrap a callback for viser so that its errors are logged as a line instead of viser's traceback."""
 
         @functools.wraps(act)
         def careful(*arguments: Any) -> None:

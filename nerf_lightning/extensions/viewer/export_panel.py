@@ -1,4 +1,4 @@
-"""The panel's part for what `nerf export` has written: each file can be downloaded."""
+"""The panel's section for the output of `nerf export`: each file can be downloaded."""
 
 from pathlib import Path
 from typing import Any
@@ -7,18 +7,18 @@ from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.escaping import for_terminal
 
-MOST_BYTES = 1 << 28  # A larger one would fill the memory of browser and viewer.
+MOST_BYTES = 1 << 28  # A larger file would fill the memory of browser and viewer.
 MOST_LETTERS = 60
 
 
 def exported_files(folder: Path) -> list[Path]:
-    """Return the files that a run's exports have left in a folder, which need not be there; links may lead anywhere."""
+    """Return the files of a run's exports in a folder, which may be missing; links may lead anywhere."""
     found = (file for file in sorted(folder.glob("*")) if not file.name.startswith("."))
     return [file for file in found if file.is_file() and not file.is_symlink()]
 
 
 class ExportPanel:
-    """Let one person download what is in the folder of exports when they come."""
+    """Let one user download what is in the folder of exports when they connect."""
 
     def __init__(self, session: ViewerClient, folder: Path):
         self.session, files = session, exported_files(folder)

@@ -1,4 +1,4 @@
-"""What is drawn over the picture: the cameras of the photographs, the crop box, and the camera path."""
+"""Draw over the picture: the cameras of the photographs, the crop box, and the camera path."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -18,12 +18,12 @@ from nerf_lightning.video.paths.recorded_path import RecordedPath
 ROOT, CAMERAS, BOX, PATH = "/overlay", "/overlay/cameras", "/overlay/crop", "/overlay/path"
 GREY, BLUE, ORANGE = (90, 90, 90), (40, 110, 220), (240, 120, 20)
 SCALE = 0.03  # Size of a frustum as a share of the photographs' distance.
-PIECES, MOST_PIECES = 24, 2000  # Pieces of the path's line for each of its legs, and in all.
-INSIDE = 3.0  # Who stands within this many sizes of a keyframe's camera has its lines all around: they are not drawn.
+PIECES, MOST_PIECES = 24, 2000  # Segments of the path's line per leg, and maximum in total.
+INSIDE = 3.0  # A keyframe's camera within this many of its sizes would surround the viewer with lines: it is not drawn.
 
 
 class Frusta:
-    """Draw cameras, the crop box and the path into what one person sees; `on_click` takes a clicked camera's view."""
+    """Draw cameras, the crop box and the path for one user; `on_click` takes a clicked camera's view."""
 
     def __init__(self, session: ViewerClient, on_click: Callable[[int], None]):
         self.session, self.scene = session, session.client.scene
@@ -46,11 +46,11 @@ class Frusta:
         self.session.draw_over("cameras", visible)
 
     def hide(self, hidden: bool) -> None:
-        """Hide everything while a photograph is compared with its render pixel by pixel, or a path is played."""
+        """Hide everything while a photograph is compared with its render, or a path is played."""
         self.root.visible = not hidden
 
     def draw_box(self, box: CropBox | None) -> None:
-        """Draw the crop box, or take it away."""
+        """Draw the crop box, or remove it."""
         if self.box is not None:
             self.box.remove()
             self.box = None
@@ -64,7 +64,7 @@ class Frusta:
         self.session.draw_over("crop box", box is not None)
 
     def draw_path(self, path: RecordedPath) -> None:
-        """Draw a path in place of the one before: its keyframes as cameras, and the line that the camera goes along."""
+        """Replace the drawn path: its keyframes as cameras, and the line that the camera follows."""
         for handle in self._path:
             handle.remove()
         self._path, self._keyframes = [], []
@@ -82,7 +82,7 @@ class Frusta:
         self.session.draw_over("path", bool(self._path))
 
     def _hide_around(self) -> None:
-        """Hide the keyframes that the person stands in: whoever has just added one would look out of it."""
+        """Hide the keyframes around the user's viewpoint: after adding one, the user would look out of it."""
         here = self.session.pose()[:, 3]
         for camera, place in list(self._keyframes):
             shown = float((place - here).norm()) > INSIDE * self.size
@@ -107,7 +107,7 @@ class Frusta:
         color: tuple[int, int, int],
         image: UInt8[np.ndarray, "height width 3"] | None = None,
     ) -> Any:
-        """Draw a camera as the pyramid that it sees; `fov` is vertical, `aspect` width over height."""
+        """Draw a camera as its viewing pyramid; `fov` is vertical, `aspect` is width over height."""
         look = {"scale": self.size, "thickness": 0.02 * self.size, "color": color, "image": image}
         shadows = {"cast_shadow": False, "receive_shadow": False}
         place = {"wxyz": quaternion_of(c2w), "position": c2w[:, 3].double().numpy()}

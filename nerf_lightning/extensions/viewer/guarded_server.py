@@ -1,7 +1,7 @@
-"""viser's server, which answers those alone whom `Auth` lets in, and tells browsers to load nothing from elsewhere.
+"""viser's server, which answers only requests that `Auth` admits, and forbids browsers to load other sites' content.
 
-viser by itself checks neither Origin nor Host, and knows no token. It serves through `websockets.serve`, which can do
-that, but no argument of viser's reaches there. So while viser starts, it finds another `serve` in that place.
+viser itself checks neither Origin nor Host, and has no token. It serves through `websockets.serve`, which supports
+that, but viser passes no such arguments. So `serve` is replaced while viser starts.
 """
 
 import logging
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
-# A machine's name or address, and perhaps a port.
+# A machine's name or address, optionally with a port.
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::[0-9]{1,5})?")
 LONGEST_PATH = 2000
 NO_TOKEN = "The access token is missing: open the whole address that nerf printed, with ?token=..."
-# viser's page has its scripts and styles within it, unpacks itself with WebAssembly, and makes workers and pictures
-# from blobs. Older browsers do not count the page's own socket as 'self'.
+# viser's page embeds its scripts and styles, unpacks itself with WebAssembly, and makes workers and pictures from
+# blobs. Older browsers do not treat the page's own socket as 'self'.
 POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src data:; connect-src 'self' ws://{host} wss://{host} data: blob:; "
@@ -39,17 +39,17 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-# websockets logs a traceback for each broken handshake, and any program can send one.
+# websockets logs a traceback for each broken handshake, which any program can send.
 unheard = logging.getLogger("nerf_lightning.extensions.viewer.handshakes")
 unheard.setLevel(logging.CRITICAL + 1)
 
 
 class Auth:
-    """Judge requests: a page is for whoever has its token, under one of its names, and from no other site.
+    """Check requests: a page is only for holders of its token, under one of its names, and not from other sites.
 
-    A site that somebody visits can send requests to this machine with that person's browser, which says truthfully
-    where they come from (Origin) and which name it believes to speak to (Host). Other programs lie as they please, so
-    they need the token; it comes in the address at first, and then in a cookie that no script reads.
+    A site that a user visits can send requests to this machine through the user's browser, which truthfully reports
+    their origin (Origin) and the name it believes to contact (Host). Other programs can lie, so they need the token; it
+    is in the address at first, and then in a cookie that scripts cannot read.
 
     Ports are not compared with the page's own, so tunnels work.
 
@@ -58,7 +58,7 @@ class Auth:
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1]; their ports do not count.
 
     Raises:
-        InputError: one of the hosts is no name.
+        InputError: one of the hosts is not a valid name.
     """
 
     def __init__(self, host: str, hosts: Sequence[str] | str | None = None):
@@ -75,7 +75,7 @@ class Auth:
         self._known = {*LOCAL, f"[{host}]" if ":" in host else host.lower(), *self._given}
 
     def refusal(self, request: "Request") -> tuple[HTTPStatus, str] | None:
-        """Return why a request is refused, in one sentence; None: it may pass."""
+        """Return why a request is refused, in one sentence; None: it is admitted."""
         hosts, origins, cookies = map(request.headers.get_all, ("Host", "Origin", "Cookie"))
         if len(request.path) > LONGEST_PATH:
             return HTTPStatus.REQUEST_URI_TOO_LONG, "The page has no address as long as this one."
@@ -94,12 +94,12 @@ class Auth:
         return HTTPStatus.FORBIDDEN, NO_TOKEN
 
     def cookie(self, port: int) -> str:
-        """Return what keeps the token in the browser, which has the cookies of one machine together for all ports."""
+        """Return the cookie with the token; browsers share the cookies of one machine between all ports."""
         return f"nerf_lightning_{port}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
 
 def guarded_server(auth: Auth, port: int) -> "ViserServer":
-    """Start viser's server behind the guard, unless this version of it serves in a way that cannot be guarded."""
+    """Start viser's server behind the guard; refuse a version of it that cannot be guarded."""
     from viser import ViserServer
     from websockets.asyncio import server as websockets_server
 
@@ -112,7 +112,7 @@ def guarded_server(auth: Auth, port: int) -> "ViserServer":
 
     websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]
     try:
-        with redirect_stdout(StringIO()):  # viser prints boxes
+        with redirect_stdout(StringIO()):  # viser prints banners
             server = ViserServer(auth.host, port, label="nerf_lightning", verbose=False)
     finally:
         websockets_server.serve = serve  # type: ignore[misc]
@@ -131,7 +131,7 @@ def _answer(
     refusal, host = auth.refusal(request), ""
     try:
         response = connection.respond(refusal[0], f"{refusal[1]}\n") if refusal else viser(connection, request)
-    except (OSError, ValueError, LookupError):  # a path that no file system takes, or a header that comes twice
+    except (OSError, ValueError, LookupError):  # a path that is invalid on any file system, or a duplicate header
         response = connection.respond(HTTPStatus.BAD_REQUEST, "This is not a request for a page.\n")
     if response is not None:
         if refusal is None:

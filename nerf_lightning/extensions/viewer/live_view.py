@@ -1,4 +1,4 @@
-"""The page of `nerf view` while training."""
+"""The page of `nerf view` during training."""
 
 import logging
 import time
@@ -24,9 +24,9 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.training_time import Clocked
 
-# Steps take their time, so a picture may as well.
+# Steps take time, so a picture may, too.
 MOVING_SECONDS = 0.5
-# How much unused time for pictures is saved up at most (seconds).
+# Maximum unused time for pictures that is saved up (seconds).
 MOST_CREDIT = 0.1
 
 
@@ -34,10 +34,10 @@ log = logging.getLogger(__name__)
 
 
 class LiveView(Callback):
-    """Render between steps, in the training's own thread, for whoever has the page open.
+    """Render between steps, in the training thread, for users who have the page open.
 
-    Training does not wait for the page: pictures get a share of the time, and viser's thread sends them. Nothing that
-    training reads is changed.
+    Training does not wait for the page: pictures get a share of the time, and viser's thread sends them. The training
+    itself is not affected.
 
     Args:
         host: the address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for everyone on the network.
@@ -48,7 +48,7 @@ class LiveView(Callback):
         hosts: names under which browsers reach the page, besides 127.0.0.1, localhost and [::1], such as gate.example.
 
     Raises:
-        InputError: no viser, no place to listen, or a host that is none.
+        InputError: viser is missing, the address or port is unavailable, or a host is invalid.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class LiveView(Callback):
         self.switch, self.said = TrainingSwitch(), ""
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        """Open the page, and say where it is."""
+        """Open the page, and log its address."""
         if not trainer.is_global_zero:
             return
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
         if scene.capture_of is not None:
-            scene = one_capture(scene, 0)  # rays that name no capture run through the first
+            scene = one_capture(scene, 0)  # rays without a capture belong to the first one
         renderer = SlicedRenderer(
             pl_module.model,
             scene_record(scene),
@@ -87,16 +87,16 @@ class LiveView(Callback):
         )
         photographs = Photographs(renderer.scene, scene, scene.background)
         folder = Path(trainer.default_root_dir) / "viewer"
-        # Other processes would wait for this one at their next step, and only for so long.
+        # Other processes would wait for this one at their next step, but only for a limited time.
         self.switch = TrainingSwitch(can_pause=ranks.world_size() == 1)
         queue = RenderQueue(renderer)
         self.page = Page(queue, photographs, folder, self.auth, self.port, self.max_height, self.switch)
         self.last = self.refreshed = time.perf_counter()
-        # Its token is for this terminal: others may read train.log.
+        # Its token is only for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
+        """Render for as long as the share allows; pause or stop if a user of the page requested it."""
         if ranks.largest(float(self.switch.wants_stop)):
             trainer.should_stop = True
             self._say(f"training was stopped from the page at step {trainer.global_step}")
@@ -126,7 +126,7 @@ class LiveView(Callback):
         self._close()
 
     def _pause(self, trainer: Trainer, system: Any, page: Page) -> None:
-        """Render for those who look on, and take no step, until somebody lets the training go on."""
+        """Render for the users, without taking steps, until a user resumes the training."""
         self._say(f"training is paused at step {trainer.global_step}, as requested from the page")
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         signals = [each for each in callbacks if isinstance(each, StopSignals)]
@@ -155,7 +155,7 @@ class LiveView(Callback):
             self.said = text
 
     def _spend(self, system: Any, queue: RenderQueue) -> None:
-        # A slice that took longer is paid back before the next one begins.
+        # A slice that took longer delays the next one accordingly.
         system.eval()
         while self.credit > 0 and queue.work():
             now = time.perf_counter()

@@ -1,4 +1,4 @@
-"""The page in the browser: viser's server, and a session for everybody who opens it."""
+"""The page in the browser: viser's server, and a session for each user."""
 
 import math
 import warnings
@@ -20,27 +20,27 @@ from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 
-# The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
+# The initial view is this many times as far from the center as the first photograph: behind the cameras.
 START = 1.4
 
 
 def require_viser() -> Any:
-    """Return viser, or say how it is installed."""
+    """Return viser, or report how to install it."""
     return require_extra("viser", "viewer", "The viewer")
 
 
 class Page:
-    """Listen, and serve everybody a picture of their own.
+    """Listen, and serve each user their own picture.
 
     Args:
-        queue: renders; whoever owns the page calls its `work`.
+        queue: renders; the owner of the page calls its `work`.
         photographs: of the capture, for frusta and comparison.
         folder: where snapshots and camera paths are written.
-        auth: judges who may speak to the page, and says where it listens.
+        auth: checks who may access the page, and defines where it listens.
         port: the port, or the first to try.
         most_height: height of the finest image, in pixels.
-        training: what the page may ask of the training that it shows; None: it shows none.
-        exports: folder of files that people can download; None: none.
+        training: controls for the training that the page shows; None: no training.
+        exports: folder of files that users can download; None: none.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Page:
         self.most_height, self.training, self.exports = most_height, training, exports
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
-        # Pages are closed while a picture is on its way to them; that needs no warning.
+        # Pages may be closed while a picture is being sent; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.server = guarded_server(auth, free_port(auth.host, port))
         self._dress(record)
@@ -68,27 +68,27 @@ class Page:
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page; who has this address has the token."""
+        """The address of the page, which contains the token."""
         place = address_of(self.server.get_host(), self.server.get_port())
         return f"{place}/?token={self.auth.token}"
 
     @property
     def is_empty(self) -> bool:
-        """Whether nobody looks on."""
+        """Whether no user is connected."""
         return not self.server.get_clients()
 
     def close(self) -> None:
-        """Stop listening; open pages say that the connection is lost."""
-        with redirect_stdout(StringIO()):  # viser says so, too
+        """Stop listening; open pages report that the connection is lost."""
+        with redirect_stdout(StringIO()):  # viser reports it, too
             self.server.stop()
 
     def _dress(self, record: SceneRecord) -> None:
-        # The share button would send everything through somebody else's server.
+        # The share button would send everything through a third-party server.
         self.server.gui.configure_theme(show_share_button=False, show_logo=False)
         self.server.scene.set_up_direction(tuple(self.around.up.tolist()))
         start = self.server.initial_camera
         first, center = record.cameras.c2w[0, :, 3], self.around.center
-        # Forward-facing captures show nothing to who stands behind their near plane's cameras.
+        # Forward-facing captures show nothing from behind the cameras of their near plane.
         farther = START if record.space == "bounded" else 1.0
         start.position = tuple((center + farther * (first - center)).tolist())
         start.look_at = tuple(center.tolist())
@@ -99,15 +99,15 @@ class Page:
         camera = client.camera
         fov = camera.fov = self._first_fov(max(1, camera.image_width) / max(1, camera.image_height))
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
-        session.start()  # the first picture is on its way while the panel is made
-        # The browser may have said once more what its field was, before it heard of this one.
+        session.start()  # the first picture is rendered while the panel is built
+        # The browser may have sent its old field of view once more before it received this one.
         Controls(session, self.folder, fov, self.training, self.exports)
-        # Who has left meanwhile may have been seen off before being here.
+        # A user who has left in the meantime may have been removed before being added.
         if client.client_id not in self.server.get_clients():
             self.queue.remove(client.client_id)
 
     def _first_fov(self, window: float) -> float:
-        """Return the field of view that begins: what the first photograph takes in, in a window of any shape."""
+        """Return the initial field of view: that of the first photograph, in a window of any shape."""
         cameras = self.photographs.record.cameras
         panorama = cameras.lens_model == "equirectangular"
         shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])

@@ -1,4 +1,4 @@
-"""The panel's part for a camera path: its keyframes, its time line, and its files."""
+"""The panel's section for a camera path: its keyframes, its timeline, and its files."""
 
 import threading
 import time
@@ -17,11 +17,11 @@ from nerf_lightning.video.paths.recorded_path import USUAL_SECONDS, RecordedPath
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600.0
 PLAY, STOP = "Play", "Stop"
 NO_FILES, NOTHING = "none yet", "No keyframes yet."
-PER_SECOND = 12  # Views a second while a path is played: more than coarse pictures come would only queue.
+PER_SECOND = 12  # Views per second while a path is played: faster than coarse pictures arrive would only queue.
 
 
 class PathPanel:
-    """Let one person make a path, look at it and save it; `frusta` draws it."""
+    """Let one user create, preview and save a path; `frusta` draws it."""
 
     def __init__(self, session: ViewerClient, path: RecordedPath, frusta: Frusta):
         self.session, self.path, self.frusta = session, path, frusta
@@ -29,7 +29,7 @@ class PathPanel:
         """The keyframe that the buttons change, from 0."""
         self._lock = threading.RLock()
         self._playing: threading.Event | None = None
-        """Set to end what is played; None: nothing is."""
+        """Set to stop playing; None: nothing is played."""
         gui, seconds = session.client.gui, {"min": LEAST_SECONDS, "max": MOST_SECONDS, "step": 0.1}
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="Add the current camera after the chosen keyframe")
@@ -54,7 +54,7 @@ class PathPanel:
         self._refresh()
 
     def _act(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """Return an act for viser to call: one after the other, and never for what the program has set itself."""
+        """Wrap a callback for viser: calls are serialized, and changes by the program itself are ignored."""
 
         def careful(event: Any) -> None:
             if event.client is None:
@@ -118,7 +118,7 @@ class PathPanel:
         threading.Thread(target=self.session.queue.errors.harmless(go), daemon=True).start()
 
     def _stop(self) -> None:
-        """Leave the camera where it is."""
+        """Stop playing; the camera stays where it is."""
         with self._lock:
             if self._playing is not None:
                 self._playing.set()
@@ -148,7 +148,7 @@ class PathPanel:
             self.file.options, self.file.value = names, kept
 
     def _refresh(self) -> None:
-        """Show the path as it is now."""
+        """Show the current path."""
         self._list_files()
         count, times = len(self.path.keyframes), self.path.times
         self.number.visible = self.delete.visible = count > 0

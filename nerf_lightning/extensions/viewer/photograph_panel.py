@@ -1,4 +1,4 @@
-"""The panel's part for photographs: one is chosen by its name, looked through, and compared with its render."""
+"""The panel's section for photographs: choose one by name, look through its camera, and compare it with its render."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ from nerf_lightning.extensions.viewer.frusta import Frusta
 from nerf_lightning.messages.escaping import as_code, for_terminal
 
 NONE = "none"
-MOST_LETTERS = 60  # Letters of a name in the list; all of it is said when it is chosen.
+MOST_LETTERS = 60  # Characters of a name in the list; the full name is shown when it is chosen.
 
 
 class PhotographPanel:
-    """Let one person choose a photograph, and compare it; meanwhile the cameras over the picture are hidden."""
+    """Let one user choose a photograph, and compare it; the cameras over the picture are hidden meanwhile."""
 
     def __init__(self, session: ViewerClient, frusta: Frusta):
         self.session, self.frusta = session, frusta
@@ -46,7 +46,7 @@ class PhotographPanel:
         self.session.enter(view)
 
     def _choose(self, event: Any) -> None:
-        if event.client is None:  # the program has set it
+        if event.client is None:  # set by the program
             return
         if self.choice.value == NONE:
             self.session.leave()

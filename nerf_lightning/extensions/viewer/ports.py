@@ -1,4 +1,4 @@
-"""Where the page is: a port to listen on, the one that is wished or the next one that is free, and its address."""
+"""The page's address and port: the requested port, or the next free one."""
 
 import logging
 import os
@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the port, or where another program has it the next free one, and say so."""
+    """Return the port, or, if another program uses it, the next free one, and log that."""
     require_address(host, port)
     for candidate in range(port, min(port + TRIED, 65_536)):
         try:
@@ -31,7 +31,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def require_address(host: str, port: int) -> None:
-    """Refuse an address that is not this machine's, and a number that is no port, whether in use or not."""
+    """Refuse an address that is not this machine's, and an invalid port number, whether in use or not."""
     if not 1 <= port <= 65_535:
         raise InputError(f"port={port}: give a number from 1 to 65535; 1024 and more need no special rights.")
     try:
@@ -44,7 +44,7 @@ def require_address(host: str, port: int) -> None:
 
 
 def address_of(host: str, port: int) -> str:
-    """Return where a browser on this machine finds what listens there.
+    """Return the URL for a browser on this machine.
 
     >>> address_of("0.0.0.0", 80), address_of("::", 80), address_of("fd00::2", 80)
     ('http://127.0.0.1:80', 'http://[::1]:80', 'http://[fd00::2]:80')
@@ -54,7 +54,7 @@ def address_of(host: str, port: int) -> str:
 
 
 def tunnel(address: str) -> list[str]:
-    """Return what somebody who is connected over SSH must do first, as a line; nothing for anybody else."""
+    """Return the command that a user connected over SSH must run first, as a line; nothing for other users."""
     found = re.match(r"http://127\.0\.0\.1:(\d+)", address)
     if found is None or "SSH_CONNECTION" not in os.environ:
         return []

@@ -1,4 +1,4 @@
-"""One person's picture: coarse at once, then finer and finer while the wish stays the same."""
+"""One user's picture: coarse at once, then progressively finer while the request is unchanged."""
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from nerf_lightning.extensions.viewer.camera_state import CameraState
 from nerf_lightning.extensions.viewer.renderer import SlicedRenderer, View
 
-# Each picture has so many times the height of the one before; the last one may have more.
+# Factor of the height from one picture to the next; it may be larger for the last one.
 FINER, AT_MOST_FINER = 2, 2.5
 # A picture has at most this many times most_height x most_height pixels; windows wider than 4:1 get a coarser one.
 MOST_SQUARES = 4
@@ -23,12 +23,12 @@ class Job:
 
 
 class ProgressiveRendering:
-    """Render what is wished, a slice at a time.
+    """Render the requested look, a slice at a time.
 
-    A finer picture whose wish has changed is dropped between two slices. A coarse one is finished and shown: it is
-    small, and somebody who never stops moving would see nothing otherwise.
+    A finer picture is dropped between two slices if the request has changed. A coarse one is finished and shown: it is
+    small, and a user who never stops moving would otherwise see nothing.
 
-    Wishes come from other threads than the one that renders; a wish is one reference, so no lock is needed. `show`
+    Requests come from other threads than the rendering one; a request is one reference, so no lock is needed. `show`
     takes each finished view, and whether it is the finest; none is higher than `most_height` pixels.
     """
 
@@ -39,31 +39,31 @@ class ProgressiveRendering:
         self.shown_height = 0
         self.is_stale = False
         self.served = 0.0
-        """When it last had a turn (queue's clock)."""
+        """Time of its last turn (the queue's clock)."""
         self._job: Job | None = None
         self._tried: CameraState | None = None
-        """Of the last job."""
+        """The look of the last job."""
 
     def ask(self, look: CameraState) -> None:
-        """Wish for another look."""
+        """Request another look."""
         self.wish = look
 
     def refresh(self) -> None:
-        """Render the finest picture once more: the model has changed, or somebody wants to keep it."""
+        """Render the finest picture again: the model has changed, or a user wants to save it."""
         self.is_stale = True
 
     def give_up(self) -> None:
-        """Drop what could not be rendered or shown, and wait for another wish, or for another model."""
+        """Drop what could not be rendered or shown, and wait for another request, or for another model."""
         self.shown, self.shown_height = self._tried, self.most_height
         self._job = None
 
     @property
     def is_moving(self) -> bool:
-        """Whether nothing at all has been shown of the present wish."""
+        """Whether nothing has been shown of the current request yet."""
         return self.wish is not self.shown
 
     def work(self, renderer: SlicedRenderer) -> bool:
-        """Render a slice; return False where nothing is left to do."""
+        """Render a slice; return False if nothing is left to do."""
         if self._job is not None and self._job.look is not self.wish and not self._job.is_coarse:
             self._job.slices.close()
             self._job = None

@@ -1,4 +1,4 @@
-"""Whose picture is rendered next: the clients of the viewer take turns, a slice of rendering each."""
+"""Choose whose picture is rendered next: the clients of the viewer take turns, with one slice each."""
 
 import logging
 import signal
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class RenderQueue:
-    """All rendering, in the thread that calls `work`: the kernels take no second one."""
+    """All rendering, in the thread that calls `work`: the kernels do not support a second one."""
 
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
@@ -36,11 +36,11 @@ class RenderQueue:
             self._refinements.pop(client, None)
 
     def serves(self, client: int) -> bool:
-        """Return whether a client has not left."""
+        """Return whether a client is still connected."""
         return client in self._refinements
 
     def wake(self) -> None:
-        """Say that a client wants another picture."""
+        """Signal that a client wants another picture."""
         self._wish.set()
 
     def refresh(self) -> None:
@@ -50,10 +50,10 @@ class RenderQueue:
                 refinement.refresh()
 
     def work(self) -> bool:
-        """Render one slice for one client; return False where all have the picture that they want.
+        """Render one slice for one client; return False if all have the picture that they want.
 
-        Clients whose camera moves come first; among equals, the one that has waited longest. A picture that cannot be
-        rendered is dropped: it ends neither the other clients' pages nor a training.
+        Clients with moving cameras come first; among equals, the one that has waited longest. A picture that cannot be
+        rendered is dropped: it affects neither the other clients' pages nor a training.
         """
         self._wish.clear()
         with self._lock:
@@ -70,7 +70,7 @@ class RenderQueue:
         return False
 
     def work_or_wait(self, seconds: float = IDLE_SECONDS) -> None:
-        """Render a slice; where nothing is left to do, sleep until somebody wants more, or for this time."""
+        """Render a slice; if nothing is left to do, sleep until a client wants more, or for this time."""
         if not self.work():
             self._wish.wait(seconds)
 
@@ -81,7 +81,7 @@ class RenderQueue:
 
 
 def received_stop_signals() -> list[int]:
-    """Return a list that SIGINT and SIGTERM are put into from now on; the slice that is being rendered ends first."""
+    """Return a list that collects SIGINT and SIGTERM from now on; the current slice is finished first."""
     received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: received.append(number))

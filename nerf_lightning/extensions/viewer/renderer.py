@@ -1,4 +1,4 @@
-"""Render a view in slices: between two of them its owner may do something else, or drop it."""
+"""Render a view in slices: between two slices, the caller may do something else, or drop it."""
 
 import time
 from collections.abc import Generator
@@ -18,33 +18,33 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_rays, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 
-SLICE_SECONDS = 0.08  # How long a slice takes, about: a person may change the wish between two.
-LEAST_HEIGHT = 32  # A picture is never smaller than this (pixels high).
+SLICE_SECONDS = 0.08  # Approximate time per slice: the user may change the request between two.
+LEAST_HEIGHT = 32  # Minimum height of a picture (pixels).
 FIRST_RAYS = 512
 WARM_UP_HEIGHT = 64
-FRESH = 0.4  # How much a new measurement of the speed counts.
+FRESH = 0.4  # Weight of a new measurement of the speed.
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What was rendered, and the camera that it was seen through."""
+    """A render and its camera."""
 
     rgb: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
-    """Distance along the ray to what stopped the light (scene units); where nothing did, far."""
+    """Distance along the ray to where the light was absorbed (scene units); far if it was not."""
     opacity: Float[Tensor, "height width"]
     camera: Cameras
 
 
 @dataclass(eq=False)
 class SlicedRenderer:
-    """Render looks with a model, and learn how fast that goes.
+    """Render looks with a model, and measure the speed.
 
     Args:
         model: in evaluation mode while it renders.
-        share: of the time that goes by, so much is spent on rendering; 1 where there is nothing else to do.
-        moving_seconds: how long a picture may take while the camera moves.
-        rays_per_second: as it was measured last.
+        share: share of the time spent on rendering; 1 if there is nothing else to do.
+        moving_seconds: maximum time for a picture while the camera moves.
+        rays_per_second: the last measurement.
     """
 
     model: Model
@@ -56,19 +56,19 @@ class SlicedRenderer:
     rays_per_second: float | None = None
 
     def height_while_moving(self, look: CameraState) -> int:
-        """Return how high a picture can be so that several come in a second."""
+        """Return the height of a picture that allows several per second."""
         rays = (self.rays_per_second or FIRST_RAYS) * self.share * self.moving_seconds
         return max(LEAST_HEIGHT, int((rays * look.height / look.width) ** 0.5))
 
     def warm_up(self) -> None:
-        """Render a small picture from the first photograph's place: kernels are loaded, the speed is known."""
+        """Render a small picture from the first photograph's position to load kernels and measure the speed."""
         look = CameraState(self.scene.cameras.c2w[0], 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT)
         for _ in range(2):
             for _ in self.slices(look, WARM_UP_HEIGHT):
                 pass
 
     def slices(self, look: CameraState, height: int) -> Generator[None, None, View]:
-        """Render a look at about this height (pixels): yields after each slice, and returns the view."""
+        """Render a look at about this height (pixels); yield after each slice, and return the view."""
         cameras, near, far = camera_of(look, self.scene, height)
         shape = int(cameras.height[0]), int(cameras.width[0])
         rays_of, clip = RayGenerator(cameras, near, far), None if look.crop is None else Clip(box=look.crop)
@@ -96,5 +96,5 @@ class SlicedRenderer:
 
     def _rays_in_a_slice(self, left: int) -> int:
         rays = QUAD * max(16, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS / QUAD))
-        # No crumb at the end: it would cost as much as a slice.
+        # No tiny remainder at the end: it would cost as much as a slice.
         return left if left < 1.5 * rays else rays

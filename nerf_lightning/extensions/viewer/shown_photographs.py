@@ -13,19 +13,19 @@ from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 THUMBNAIL = 96
-MOST_FRUSTA = 150  # More frusta hide each other, and the page takes long to build.
+MOST_FRUSTA = 150  # More frusta occlude each other, and slow down the page.
 
 
 class Photographs:
-    """What was photographed from the cameras of a checkpoint.
+    """The photographs of a checkpoint's cameras.
 
-    `scene` is the capture as it was read again, whose views are known by their names; None: there are no pictures.
+    `scene` is the capture, read again, whose views are matched by name; None: there are no pictures.
     """
 
     def __init__(self, record: SceneRecord, scene: Scene | None, background: Background):
         self.record, self.background = record, background
         self.when_read: list[Callable[[], None]] = []
-        """What is called when pictures have come."""
+        """Callbacks for when pictures become available."""
         self.take(scene)
 
     def take(self, scene: Scene | None) -> None:
@@ -51,7 +51,7 @@ class Photographs:
         """Return a photograph in this size (pixels)."""
         assert self.scene is not None
         rgba = self.scene.pixels.view(self._views[self.record.view_names[view]])
-        # Most pixels of a large photograph need not be looked at; two for each that is shown are smooth enough.
+        # Most pixels of a large photograph need not be read; two per shown pixel are smooth enough.
         step = max(1, min(rgba.shape[0] // (2 * height), rgba.shape[1] // (2 * width)))
         behind = background_colors(self.background, 1, torch.device("cpu"), random=None)
         whole = to_bytes(blend(rgba[::step, ::step].float() / 255.0, behind))
@@ -59,7 +59,7 @@ class Photographs:
         return torch.from_numpy(np.array(small))
 
     def thumbnail(self, view: int) -> UInt8[Tensor, "height width 3"] | None:
-        """Return a small picture for a frustum, or None where there is no photograph."""
+        """Return a small picture for a frustum; None if there is no photograph."""
         if not self.has(view):
             return None
         width, height = (int(size[view]) for size in (self.record.cameras.width, self.record.cameras.height))

@@ -1,53 +1,53 @@
-"""What a person in the page asks of the training: to pause, to go on, to stop."""
+"""Requests of the page's users to the training: pause, resume, stop."""
 
 import time
 from collections.abc import Callable
 
 from nerf_lightning.extensions.viewer.client import ViewerClient
 
-AWAY_SECONDS = 15.0  # A page that is loaded again is away for a moment; whoever is away for longer has left.
+AWAY_SECONDS = 15.0  # A page that is reloaded is away for a moment; a user who is away for longer has left.
 PAUSE, GO_ON = "Pause", "Go on"
 STOP, SURE = "Stop training", "Really stop: press again"
-SURE_SECONDS = 8.0  # How long the second press is waited for.
+SURE_SECONDS = 8.0  # Maximum time until the second press.
 WHAT_STOP_IS = "The checkpoint is written, and the run evaluated."
 
 
 class TrainingSwitch:
-    """Wishes of the pages, for the thread that trains.
+    """Requests of the pages, for the training thread.
 
     Args:
-        can_pause: whether it may pause: several processes wait for each other only for a while.
+        can_pause: whether it may pause: several processes wait for each other only for a limited time.
     """
 
     def __init__(self, can_pause: bool = True):
         self.can_pause = can_pause
         self.step, self.num_steps = 0, 0
-        """How far the training is; its owner sets them."""
+        """Progress of the training; its owner sets them."""
         self.wants_pause = self.wants_stop = False
         self.on_change: dict[int, Callable[[], None]] = {}
-        """What shows each person how it stands, by their number."""
+        """Callbacks that show each user the state, by client ID."""
 
     def pause(self) -> None:
-        """Let the training wait after the step that is being taken."""
+        """Pause the training after the current step."""
         self.wants_pause = self.can_pause
         self.show()
 
     def go_on(self) -> None:
-        """Let it go on."""
+        """Resume the training."""
         self.wants_pause = False
         self.show()
 
     def stop(self) -> None:
-        """End it after the step that is being taken, as if that had been its last: saved, and evaluated."""
+        """End it after the current step, as if that were its last: it is saved and evaluated."""
         self.wants_stop, self.wants_pause = True, False
         self.show()
 
     def pause_while(
         self, work: Callable[[], None], is_anybody_here: Callable[[], bool], ends: Callable[[], bool]
     ) -> float:
-        """Do other work until somebody lets the training go on, or nobody is left; return for how many seconds.
+        """Do other work until a user resumes the training, or no user is left; return the duration in seconds.
 
-        Each call of `work` takes at least a moment; `ends` says that the training must not wait any longer.
+        Each call of `work` takes at least a moment; `ends` returns whether the training must stop waiting.
         """
         began = seen = time.monotonic()
         while self.wants_pause and not ends():
@@ -60,20 +60,20 @@ class TrainingSwitch:
         return time.monotonic() - began
 
     def show(self) -> None:
-        """Let every page show how it stands."""
+        """Show the state on every page."""
         for show in list(self.on_change.values()):
             show()
 
     @property
     def state(self) -> str:
-        """How it stands, in words."""
+        """The state in words."""
         how = "Stopping at" if self.wants_stop else "Paused at" if self.wants_pause else "Running:"
         far = f"step {self.step:,} of {self.num_steps:,}" if self.num_steps else "the first step"
         return f"{how} {far}. {WHAT_STOP_IS if self.wants_stop else ''}".strip()
 
 
 class TrainingPanel:
-    """The panel's part that lets one person hold or end the training."""
+    """The panel's section in which one user can pause or end the training."""
 
     def __init__(self, session: ViewerClient, switch: TrainingSwitch):
         self.session, self.switch = session, switch
@@ -91,7 +91,7 @@ class TrainingPanel:
         self.show()
 
     def show(self) -> None:
-        """Show how it stands."""
+        """Show the state."""
         switch = self.switch
         if not self.session.is_here():
             switch.on_change.pop(self.session.client.client_id, None)

@@ -1,9 +1,9 @@
 """Measure training and rendering speed, compared with plain PyTorch and with the machine's matrix rate.
 
-Medians of ratios: machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are
-compared round by round. Kinds: the configured step (tiled or replayed, in the configured precision), the same step in
-plain float32 without tiles, a replayed step with its kernels launched one by one, the machine's matrix product, making
-a batch, the configured step with batches from the loader, and rendering.
+Results are medians of ratios: machines are noisy and their speed drifts, so every round measures each kind once, and
+two kinds are compared round by round. Kinds: the configured step (tiled or replayed, in the configured precision), the
+same step in plain float32 without tiles, a replayed step with its kernels launched one by one, the machine's matrix
+product, making a batch, the configured step with batches from the loader, and rendering.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +44,7 @@ Rows = dict[str, Float[np.ndarray, "rounds"]]
 
 
 def run(config: DictConfig) -> float:
-    """Measure, print a table, write bench.json; return training rays per second."""
+    """Measure, print a table and write bench.json; return training rays per second."""
     config, scene = _settled(config)
     bench = prepare(config, scene)
     for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
@@ -77,7 +77,7 @@ def run(config: DictConfig) -> float:
 
 
 def _settled(config: DictConfig) -> tuple[DictConfig, Scene]:
-    """Return the config with what is chosen for its scene, and the scene."""
+    """Return the config with the choices for its scene, and the scene."""
     choices, overrides = HydraConfig.get().runtime.choices, typed_overrides()
     on_gpu = build(config.trainer).device_type == "cuda"
     config, scene = read_scene(config, choices, overrides, on_gpu)
@@ -96,7 +96,7 @@ def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:
 
 
 def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
-    """Return what is said of training and rendering, and the operations of training per ray."""
+    """Return the rows about training and rendering, and the operations of training per ray."""
     steps, render_rays = config.steps, config.render_rays
     loaded_steps = LoadedSteps(bench.batches, bench.train_on, steps)
     scales = config.scaling and bench.settings.device_type == "cpu"
@@ -149,7 +149,7 @@ def _on_threads(count: int, work: Work) -> None:
 
 
 def _rows_of_kernels(device: torch.device, rounds: int) -> Rows:
-    """Return how long our kernels take, and how many times longer torch takes."""
+    """Return the time of our kernels, and torch's time relative to it."""
     rows = {}
     for name, works in compared_kernels(device).items():
         seconds = _interleaved(works, rounds)

@@ -1,4 +1,4 @@
-"""`nerf bench`: what it measures, and where it writes it."""
+"""`nerf bench`: what it measures, and where it writes the results."""
 
 import json
 

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from nerf_lightning.data.bricks.parts import fire_engine
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 
-# Lines that come from so far above the horizon, as the photographs do (sine of the elevation).
+# Minimum elevation of the lines above the horizon, like that of the photographs (sine).
 LOWEST = 0.05
 REACH = 2.1
 AT_ONCE = 4_000

@@ -50,7 +50,7 @@ def colors_of(mesh):
 def test_a_ball_is_a_ball_in_every_format(tmp_path, format):
     mesh = exported(tmp_path, solid(ball()), record(), format=format)
     radius = np.linalg.norm(mesh.vertices, axis=1)
-    # The surface that rendering sees lies where light is stopped: about the width of the ramp outside.
+    # The surface that rendering sees is where light is absorbed: about the width of the ramp outside.
     assert np.abs(radius - RADIUS).max() < 0.05
     assert radius.std() < 0.005
     assert mesh.is_watertight
@@ -104,7 +104,7 @@ def test_glb_has_y_up_and_the_others_keep_the_captures_frame(tmp_path, up):
         red = colors_of(mesh)[:, 0] > 128
         assert height[red].mean() > 0.2 > -0.2 > height[~red].mean()
     exported(tmp_path, model, scene, format="glb", resolution=16)
-    # As glTF says: a node's matrix stands column by column, and is that of its parent times its own.
+    # As in glTF: a node's matrix is in column-major order, and is multiplied by its parent's from the left.
     tree = _glb_tree(tmp_path / "mesh.glb")
     (root,) = tree["scenes"][tree["scene"]]["nodes"]
     matrix = np.array(tree["nodes"][root]["matrix"]).reshape(4, 4).T
@@ -127,13 +127,13 @@ def test_grey_is_the_same_grey_but_linear_in_glb(tmp_path, colors):
 
 
 def test_the_surface_is_where_the_depth_of_the_pictures_is(tmp_path):
-    # Thin matter is seen deep inside; the level follows.
+    # Rendering sees thin matter deep inside; the level follows.
     dense, thin = (exported(tmp_path, solid(ball(), inside=inside), record()) for inside in (4000.0, 40.0))
     assert np.linalg.norm(dense.vertices, axis=1).mean() > np.linalg.norm(thin.vertices, axis=1).mean() + 0.02
 
 
 def test_haze_in_front_of_a_surface_is_not_taken_for_it(tmp_path):
-    """A quarter of the light is stopped before it reaches the ball, so the expected depth lies in the haze."""
+    """A quarter of the light is absorbed before it reaches the ball, so the expected depth is in the haze."""
     model = solid(ball(RADIUS), inside=50.0)
     clear = model.last.field.density
     model.last.field.density = lambda points: (clear(points)[0] + 0.1, None)
@@ -169,7 +169,7 @@ def test_a_scene_in_another_frame_gives_the_same_mesh_in_the_new_place(tmp_path,
     for a, b in ((moved, other.vertices), (other.vertices, moved)):
         assert cKDTree(a).query(b)[0].max() < scale * spacing
     assert other.volume == pytest.approx(scale**3 * one.volume, rel=0.01)
-    # Both stand on the solid itself.
+    # Both are on the solid itself.
     assert float(shape(torch.tensor(one.vertices).float()).abs().max()) < 0.02
 
 
@@ -192,7 +192,7 @@ def test_of_two_parts_alike_both_are_kept():
 
 
 def test_what_no_view_sees_is_removed_when_asked(tmp_path):
-    def hollow(positions):  # a shell: its inside is a surface that nobody sees
+    def hollow(positions):  # a shell: its inside is an invisible surface
         return torch.maximum(ball(0.8)(positions), -ball(0.4)(positions))
 
     whole = exported(tmp_path, solid(hollow), record())
@@ -236,7 +236,7 @@ def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypat
         exported(tmp_path, solid(ball()), record(), resolution=2048)
     fitting = int(str(error.value).split("what.resolution=")[2].split(" ")[0])
     assert (fitting + 1) ** 3 <= 1e8 < (fitting + 2) ** 3
-    with pytest.raises(InputError, match="4194304 x 4194304 x 4194304 points"):  # 64 bits count none
+    with pytest.raises(InputError, match="4194304 x 4194304 x 4194304 points"):  # too many for 64 bits
         exported(tmp_path, solid(ball()), record(), resolution=2**22 - 1)
     exported(tmp_path, solid(ball()), record(), resolution=20)
 
@@ -259,7 +259,7 @@ def test_a_ball_comes_back_to_within_a_cell_and_only_what_is_seen_of_it(tmp_path
     outward = (np.asarray(mesh.vertex_normals) * mesh.vertices).sum(axis=1) / radius
     assert outward.min() > 0.0
     assert outward.mean() > 0.95
-    # Four views from a half circle: what is turned away from all of them is not there.
+    # Four views from a half circle: what faces away from all of them is missing.
     eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3].numpy()
     places = mesh.vertices / radius[:, None]
     assert (places @ (eyes / np.linalg.norm(eyes, axis=1, keepdims=True)).T).max(axis=1).min() > -0.1

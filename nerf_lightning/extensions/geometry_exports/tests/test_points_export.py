@@ -1,4 +1,4 @@
-"""Point clouds: on known surfaces, with normals; what one view alone sees is left out."""
+"""Point clouds: on known surfaces, with normals; what only one view sees is left out."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_what_one_view_alone_sees_is_left_out(tmp_path):
     scene = scene_record(ball_scene(num_views=6, size=24))  # 60 degrees apart
     eye = scene.cameras.c2w[scene.splits["train"][0], :, 3]
 
-    def with_speck(positions):  # close before one camera, outside of what the others see
+    def with_speck(positions):  # close to one camera, outside the others' view
         return torch.minimum(ball(0.7)(positions), ball(0.12, (0.48 * eye).tolist())(positions))
 
     everything, _ = exported(tmp_path, solid(with_speck), scene, agreement=0)

@@ -1,4 +1,4 @@
-"""Grids: the density where it is, in the user's units, and colors where something is."""
+"""Grids: density at the right place, in the user's units, and colors of occupied cells."""
 
 import json
 import tracemalloc

@@ -25,7 +25,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 
 KEPT = ("format", "choices", "scene", "refined", "precision", "tile_points")
-"""What of a checkpoint's record does not depend on widths or on a run that is going on."""
+"""The parts of a checkpoint's record that do not depend on widths or on a running training."""
 SETTINGS = {each.name: each.type for each in fields(Pruning)} | {
     "keep": float,
     "tables": NumberType,
@@ -35,12 +35,12 @@ SETTINGS = {each.name: each.type for each in fields(Pruning)} | {
 
 
 def run(config: DictConfig) -> float | None:
-    """Write a smaller checkpoint, in this process alone, and fine-tune it where that is asked for.
+    """Write a smaller checkpoint, in this process alone, and fine-tune it if requested.
 
-    Returns the PSNR (dB) that fine-tuning came to, which sweepers may maximise.
+    Returns the PSNR (dB) after fine-tuning, which sweepers may maximize.
 
     Raises:
-        InputError: the checkpoint cannot be read, nothing of it can be left out, or too much is to be.
+        InputError: the checkpoint cannot be read, nothing in it can be removed, or too much would be.
     """
     for name, kind in SETTINGS.items():
         require_fitting(config[name], kind, name)
@@ -75,7 +75,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def _require_own(target: Path) -> None:
-    """Refuse to write over what is no checkpoint that was made smaller: one of a run has more than weights."""
+    """Refuse to overwrite anything but a pruned checkpoint: a run's checkpoint has more than weights."""
     try:
         is_own = not target.exists() or "optimizer_states" not in read_content(target)
     except InputError:
@@ -88,7 +88,7 @@ def _require_own(target: Path) -> None:
 
 
 def _content(narrow: Checkpoint, quantized: dict[str, Any]) -> dict[str, Any]:
-    """Return what the file holds; training cannot go on from it, since an optimizer's state has the wider shapes."""
+    """Return the file's content; training cannot resume from it, since an optimizer's state has the wider shapes."""
     elsewhere = {name for part in quantized.values() for name in part}
     state = {f"model.{name}": tensor for name, tensor in narrow.weights.items()}
     record = {key: narrow.record[key] for key in KEPT if key in narrow.record}

@@ -34,7 +34,7 @@ def test_what_counts_most_stays():
 
 
 def test_a_coreset_by_hand():
-    """P = (0.6, 0.1, 0.3); of four draws three are the first neuron, and an undrawn one takes the free place."""
+    """P = (0.6, 0.1, 0.3); three of four draws are the first neuron, and an undrawn one fills the free slot."""
     layer = Neurons(torch.tensor([[3.0], [1.0], [1.0]]), torch.tensor([[2.0, 1.0, -3.0]]))
     kept = coreset(layer, 3, torch.tensor([0.0, 0.2, 0.59, 0.65]))
     assert kept.numbers.tolist() == [0, 1, 2]

@@ -1,4 +1,4 @@
-"""Weights in fewer bytes: how far they are off, and what files from strangers may not say."""
+"""Quantized weights: their error, and what untrusted files must not contain."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def test_float32_comes_back_to_the_bit_float16_to_eleven_and_int8_to_half_a_step
     for first, last in ((0, 40), (40, 100), (100, 150)):
         step = rows[first:last].abs().max() / 127
         assert float((eighth - rows)[first:last].abs().max()) <= 0.5001 * float(step)
-    assert torch.equal(round_trip(eighth, "int8", STARTS)[0], eighth)  # a second time nothing more is lost
+    assert torch.equal(round_trip(eighth, "int8", STARTS)[0], eighth)  # nothing more is lost the second time
 
 
 def test_rows_that_are_left_out_come_back_as_their_levels_mean():

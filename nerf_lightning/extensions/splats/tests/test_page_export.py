@@ -1,4 +1,4 @@
-"""The page as a file: what stands in it, what it refuses, and that a stranger's texts stay texts."""
+"""The page as a file: its content, what it refuses, and that untrusted texts stay texts."""
 
 import os
 from dataclasses import replace
@@ -80,7 +80,7 @@ def test_texts_of_a_stranger_stay_texts(page, tmp_path):
     names = tuple(f"{NAME}{view}\x1b\u202e" for view in range(6))
     planted = exported(tmp_path, replace(all_around(), name=NAME, view_names=names), facts=[(NAME, NAME)])
     ours, theirs = Elements(page.read_text()), Elements(planted.read_text())
-    # A fact more is a row more.
+    # One more fact is one more row.
     assert [tag for tag, _ in theirs.found if tag not in ("tr", "th", "td")] == [
         tag for tag, _ in ours.found if tag not in ("tr", "th", "td")
     ]

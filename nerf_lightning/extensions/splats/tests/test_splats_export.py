@@ -42,7 +42,7 @@ def exported(folder, model, scene, photographs=True, **settings):
 
 
 def test_fitting_brings_the_splats_nearer_to_the_photographs(tmp_path):
-    """And none is thinner than the pixels of the nearest photograph."""
+    """No splat is thinner than the pixels of the nearest photograph."""
     scene, model = photographed_ball(32)
     lost = []
     for seconds in (0.0, 1.5):

@@ -1,4 +1,4 @@
-"""A model of many scenes small enough for tests, and what it looks at."""
+"""A model of many scenes small enough for tests, and its inputs."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def looking_model(scene=None, views=range(6), **changes) -> ViewTransformer:
 
 
 def rays_of_views(scene, views, every=7):
-    """Some rays of views, one view after the other, each of which says whose it is."""
+    """Some rays of views, view by view, each of which knows its view."""
     parts = []
     for view in views:
         pixels = all_pixels(scene.cameras, view).map(lambda picture: picture.flatten()[::every])

@@ -27,7 +27,7 @@ def run(config: DictConfig) -> None:
         scene = scene_to_look_at(opened, config.scene if config.photographs else None)
         record = scene_record(scene)
     background = known_background(config.background or record.background)
-    # Made when somebody saves something: a checkpoint may lie where nothing can be written.
+    # Made when a user saves something: a checkpoint may be in a read-only place.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "viewer"))
     renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)
     renderer.warm_up()
@@ -37,7 +37,7 @@ def run(config: DictConfig) -> None:
     page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
-    if config.photographs and scene is None:  # large ones take long, and the page needs none to begin with
+    if config.photographs and scene is None:  # large ones take long, and the page does not need them to start
         Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:
         while not stopped:

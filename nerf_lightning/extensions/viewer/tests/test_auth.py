@@ -1,4 +1,4 @@
-"""Who may speak to the page: its own browser tabs and whoever has the token; nobody else, and no other site."""
+"""Access to the page: only its own browser tabs and holders of the token, and no other site."""
 
 import socket
 import sys
@@ -20,7 +20,7 @@ def page(tmp_path_factory):
 
 
 def refused(call) -> str:
-    """Expect 403, and return what is said."""
+    """Expect 403, and return the message."""
     with pytest.raises(InvalidStatus) as caught:
         call()
     response = caught.value.response
@@ -50,7 +50,7 @@ def test_a_proxy_that_hides_the_name_is_let_in_by_its_own(page):
 
 
 def test_another_host_is_refused_although_it_has_the_token(page):
-    """DNS rebinding: a stranger's name that means this machine."""
+    """DNS rebinding: an attacker's name that resolves to this machine."""
     assert "viewer.hosts=[evil.example]" in refused(lambda: page.as_host(f"evil.example:{page.port}"))
     assert page.get(f"/?token={page.token}", Host=f"evil.example:{page.port}")[0] == 403
     assert page.get(f"/?token={page.token}", Host="127.0.0.1, evil.example")[0] == 403

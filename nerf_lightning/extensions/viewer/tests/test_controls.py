@@ -1,4 +1,4 @@
-"""The panel: what is saved where it can be, and what is not there is said."""
+"""The panel: files are saved where possible, and missing ones are reported."""
 
 import re
 import threading

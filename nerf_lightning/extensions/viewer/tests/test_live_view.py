@@ -1,4 +1,4 @@
-"""The page while training: it shows what is learned, changes nothing of it, and closes with the run."""
+"""The page during training: it shows the model, does not change it, and closes with the run."""
 
 import math
 import re
@@ -44,7 +44,7 @@ def address_in(process):
 
 @pytest.mark.minutes
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
-    steps = "trainer.max_steps=160"  # Long enough for two people who come and go.
+    steps = "trainer.max_steps=160"  # Long enough for two users who come and go.
     alone = run(capture, tmp_path / "alone", steps)
     page = ("viewer=on", f"viewer.live_view.port={unused_port()}", "viewer.live_view.max_height=48")
     watched = run(capture, tmp_path / "watched", steps, *page)
@@ -167,7 +167,7 @@ def test_what_cannot_be_drawn_ends_no_training(trainer, caplog):
 
 
 class Watched:
-    """A callback whose page is looked at by as many people as `seats`."""
+    """A callback whose page has as many users as `seats`."""
 
     def __init__(self, trainer, monkeypatch):
         renderer = MagicMock(spec=SlicedRenderer)
@@ -176,7 +176,7 @@ class Watched:
         self.callback, self.trainer, self.turns = LiveView(), trainer, 0
         self.callback.page = self.page
         self.at_turn = {}
-        """What happens at which turn of the pause."""
+        """Events by turn of the pause."""
         monkeypatch.setattr(self.page.queue, "work", self.work)
 
     def work(self):
@@ -224,7 +224,7 @@ def test_a_pause_costs_no_budget_and_no_speed(watched, monkeypatch):
 
 
 def test_a_training_that_nobody_watches_any_more_goes_on(watched, monkeypatch):
-    """A browser that is closed, or whose machine sleeps, must not hold a training for ever."""
+    """A browser that is closed, or whose machine sleeps, must not pause a training forever."""
     now = [0.0]
     monkeypatch.setattr(training_switch.time, "monotonic", lambda: now[0])
     watched.callback.switch.pause()

@@ -1,4 +1,4 @@
-"""Several people in front of one page: what one of them sends harms neither the page nor the others."""
+"""Several users of one page: what one of them sends harms neither the page nor the others."""
 
 import logging
 import math
@@ -72,7 +72,7 @@ def test_an_error_while_drawing_for_one_ends_neither_the_page_nor_the_loop(page,
     (line,) = [record.getMessage() for record in caplog.records if "drawn" in record.getMessage()]
     assert "\n" not in line
     other.look_from(50)
-    other.wait_for(len)  # it is served again when it wishes for what can be drawn
+    other.wait_for(len)  # it is served again when it requests what can be drawn
     other.close()
 
 

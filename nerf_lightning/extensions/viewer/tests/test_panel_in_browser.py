@@ -1,4 +1,4 @@
-"""What a person does in the panel, in a real and narrow browser: a path, its preview, a film, a photograph."""
+"""Use of the panel in a real, narrow browser: a path, its preview, a film, a photograph."""
 
 import math
 import time
@@ -33,7 +33,7 @@ def button(browser, label):
 
 
 def number(browser, label):
-    """The number beside a label of the panel."""
+    """The number next to a label of the panel."""
     found = browser.find_elements("xpath", f"//*[text()='{label}']/following::input[not(@type='hidden')][1]")
     return float(found[0].get_attribute("value")) if found and found[0].get_attribute("value") else None
 
@@ -74,4 +74,4 @@ def test_a_person_makes_a_path_plays_it_films_it_and_chooses_a_photograph(tmp_pa
         press(browser, "xpath", "//*[text()='View from']/following::input[1]")
         press(browser, "xpath", "//*[@role='option'][2]")
         wait(lambda: f"Camera of {NAME}" in text(browser))
-        assert browser.title == "Viser"  # a stranger's name is text
+        assert browser.title == "Viser"  # an untrusted name is text

@@ -1,4 +1,4 @@
-"""The panel's camera path: what a person changes, and what is drawn of it."""
+"""The panel's camera path: what users change, and what is drawn of it."""
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_playing_ends_when_the_browser_goes(panel):
 
 
 def test_whoever_adds_a_keyframe_does_not_stand_in_its_lines(tmp_path):
-    """Its camera is drawn where the person is: from within, it is bars across the picture."""
+    """Its camera is drawn at the user's viewpoint: from within, it is bars across the picture."""
     panel = Panel(tmp_path)
     panel.press("Add keyframe")
     camera = panel.client.scene.add_camera_frustum.return_value

@@ -33,7 +33,7 @@ def renderer(scene):
 
 @pytest.fixture
 def behind_grid(scene):
-    """A model that asks its field only in occupied cells: those in which the photographs' alpha leaves something."""
+    """A model that evaluates its field only in occupied cells: those that the photographs' alpha does not rule out."""
     model = fast_model(RaggedLevel).eval()
     model.fit_to(scene)
     return SlicedRenderer(model, scene_record(scene), "white", 4096)

@@ -148,7 +148,7 @@ def folder_of_page(monkeypatch):
 
 
 def test_nothing_is_written_before_somebody_saves(nerf, tmp_path, folder_of_page):
-    """A file in the folder's place stands for all that cannot be written: root may write anywhere."""
+    """A file in the folder's place represents everything that is not writable: root may write anywhere."""
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
     checkpoint = write_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     (tmp_path / "run" / "viewer").write_text("")
