@@ -77,7 +77,8 @@ def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, 
     assert f"{psnr[0]:.2f}" in lines[2]
     assert f"{psnr[0]:.2f}" in output
     if launcher == "parallel":
-        assert output.count(f"cpu, {max(1, num_cores() // 2)} threads") == 2
+        count = max(1, num_cores() // 2)
+        assert output.count(f"cpu, {count} thread{'s' * (count != 1)} (") == 2
         for number in (0, 1):
             assert f"[{number + 1}/2 seed={number}] test PSNR" in output
             assert f"INFO  [{number + 1}/2 seed={number}] run folder" in output
