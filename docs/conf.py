@@ -1,5 +1,6 @@
 """How Sphinx builds these documents: make docs."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -19,6 +20,8 @@ html_math_renderer = "mathml"
 html_theme = "furo"
 html_show_copyright = False
 html_extra_path = ["llms.txt"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 exclude_patterns = ["_build", "README.md"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
@@ -38,15 +41,28 @@ settings_page.write(HERE)
 site_pages.write()
 
 
+BOLD = re.compile(r'<mi mathvariant="bold">([A-Za-z])</mi>')
+
+
+def mathml(formula, display="inline"):
+    """Return a formula as MathML; browsers know bold letters only as letters of their own (U+1D400 and so on)."""
+
+    def bold(letter):
+        first, offset = (0x1D400, ord("A")) if letter[1].isupper() else (0x1D41A, ord("a"))
+        return f"<mi>{chr(first + ord(letter[1]) - offset)}</mi>"
+
+    return BOLD.sub(bold, convert(formula, display=display))
+
+
 def inline_math(page, node):
     """Write a formula in a line of text."""
-    page.body.append(convert(node.astext()))
+    page.body.append(mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def display_math(page, node):
     """Write a formula on a line of its own."""
-    page.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    page.body.append(f'<div class="math">{mathml(node.astext(), "block")}</div>')
     raise nodes.SkipNode
 
 

@@ -74,13 +74,13 @@ def within_site(text: str, folder: Path) -> str:
 
 
 def _index() -> Iterator[str]:
-    """Yield docs/README.md with a table of contents in place of each list of links."""
+    """Yield docs/README.md, whose lists of links become the sidebar."""
     introduction, *sections = within_site((DOCS / "README.md").read_text(encoding="utf-8"), DOCS).split("\n## ")
     yield introduction
     for section in sections:
         caption, _, links = section.partition("\n")
         pages = [os.path.splitext(page)[0] for page in LINK.findall(links)] + WITHOUT_LINKS.get(caption, [])
-        yield from ("```{toctree}", f":caption: {caption}", ":maxdepth: 1", "", *pages, "```", "")
+        yield from ("```{toctree}", f":caption: {caption}", ":maxdepth: 1", ":hidden:", "", *pages, "```", "")
 
 
 def _api() -> Iterator[str]:
