@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.model_for_scene import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
 from nerf_lightning.config.overrides import key_of, leaves
+from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
@@ -21,6 +22,8 @@ AUTO = "auto"
 EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 CPU_SECONDS = 300
 """Of training on a CPU where no length is given: with cameras, evaluation and film about ten minutes on two cores."""
+PAGE_SECONDS, PAGE_FROM = 100, 100
+"""What the page of a scene takes of CPU_SECONDS, and the shortest training of photographs after which it is written."""
 SHORT_SECONDS, SHORT_GPU_SECONDS = 100, 10
 """In less time, more and cheaper steps are worth more than finer grids."""
 FEW_PHOTOGRAPHS = 30
@@ -115,6 +118,11 @@ def resolve_auto(
     config, choices = fit_model("train", config, choices, overrides, scene, device_type == "cuda", seconds, former)
     _settle(config, "doctor", is_capture)
     _settle(config.final, "report", is_capture)
+    writes_page = _writes_page(config, choices, is_capture, seconds)
+    if writes_page and config.budget.seconds == AUTO and former is None:
+        seconds = CPU_SECONDS - PAGE_SECONDS
+    if not isinstance(config.final.page, DictConfig):  # else the exporter's settings are typed
+        _settle(config.final, "page", writes_page)
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
     if config.budget.seconds is None and config.trainer.max_steps is None and config.trainer.max_epochs is None:
@@ -126,6 +134,12 @@ def resolve_auto(
         else:
             config.evaluation.max_views = _views_for(scene, config) if device_type == "cpu" else None
     return config, chosen(choices)
+
+
+def _writes_page(config: DictConfig, choices: Mapping[str, Any], is_capture: bool, seconds: int | float | None) -> bool:
+    """Return whether the page of the scene is written although nobody has asked for it."""
+    photographs = is_capture and choices.get("model") == PHOTOGRAPHS and config.final.page == AUTO
+    return photographs and seconds is not None and seconds >= PAGE_FROM and "page" in option_names("what")
 
 
 def _views_for(scene: Scene, config: DictConfig) -> int | None:

@@ -35,7 +35,7 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     Raises:
         InputError: there is no such exporter or setting, or its value makes no sense.
     """
-    asked = {name: value for name, value in final.items() if name not in NO_EXPORTERS and value is not False}
+    asked = {name: value for name, value in final.items() if name not in NO_EXPORTERS and value not in (False, "auto")}
     return {str(name): _exporter(str(name), value) for name, value in asked.items()}
 
 

@@ -203,14 +203,32 @@ def test_settings_of_the_user_hold_in_the_model_that_is_chosen():
 
 
 def test_captures_are_examined_trained_for_minutes_and_reported():
+    pytest.importorskip("nerf_lightning.extensions.splats", reason="whose page takes part of the time")
     photos, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "scene.root=a")
-    assert (photos.doctor, photos.final.report, photos.budget.seconds) == (True, True, 300)
+    assert (photos.doctor, photos.final.report, photos.budget.seconds) == (True, True, 200)
     other, _ = chosen_for(PHOTOGRAPHS, "scene=colmap", "scene.root=a")
-    assert (other.doctor, other.final.report, other.budget.seconds) == (True, True, 300)
+    assert (other.doctor, other.final.report, other.budget.seconds) == (True, True, 200)
     built_in, _ = chosen_for(PHOTOGRAPHS, "scene=bricks")
     assert (built_in.doctor, built_in.final.report) == (False, False)
     given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false")
     assert (given.doctor, given.final.report) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("scene", "typed", "page"),
+    [
+        (PHOTOGRAPHS, (), True),
+        (PHOTOGRAPHS, ("budget.seconds=100",), True),
+        (PHOTOGRAPHS, ("budget.seconds=99",), False),
+        (PHOTOGRAPHS, ("trainer.max_steps=900",), False),
+        (PHOTOGRAPHS, ("final.page=false",), False),
+        (PHOTOGRAPHS, ("trainer.max_steps=900", "final.page=true"), True),
+        (IN_A_BOX, (), False),
+    ],
+)
+def test_photographs_that_are_trained_on_for_long_enough_become_a_page(scene, typed, page):
+    pytest.importorskip("nerf_lightning.extensions.splats", reason="an extension, which is not here")
+    assert chosen_for(scene, "scene=photos", "scene.root=a", *typed)[0].final.page is page
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ OURS = {
     "config/help/search.py": ["read_text"],
     "config/help/yaml_comments.py": ["read_text"],
     "extensions/splats/page_file.py": ["read_text"],
-    "messages/console.py": ["print"],
+    "messages/console.py": ["print", "print"],
     "training/loggers.py": ["open"],
     "runs/sweep.py": ["print"],
     "evaluation/protocol.py": ["read_text"],

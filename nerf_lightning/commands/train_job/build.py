@@ -11,6 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.auto_settings import AUTO
+from nerf_lightning.config.exporters import exporters_after_training
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.messages.console import say
@@ -47,6 +49,8 @@ class TrainJob(Run):
 def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
+    if job_folder() is not None and asked.final.page == AUTO:
+        asked.final.page = False  # the runs of a sweep are compared, not handed over
     job = assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
     if job_folder() is not None:
         job.signals.stop_file = stop_file(Path(HydraConfig.get().sweep.dir))
@@ -78,6 +82,7 @@ def assemble_job(
             each.require_access()
     run = plan_run(asked, choices, overrides, settings, scene, former)
     config = run.config
+    post_training.exports = exporters_after_training(config.final)  # of what was left open, too
     post_training.require_film(run.scene)
     if post_training.scoring is not None:
         post_training.scoring.max_views = config.evaluation.max_views
