@@ -24,6 +24,7 @@ from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
+from nerf_lightning.messages.exit_codes import BAD_INPUT, INTERRUPTED
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -48,8 +49,6 @@ nerf COMMAND --help lists the groups, the settings and examples of a command.
 nerf help NAME explains a setting, group or option: nerf help trainer.max_steps.
 nerf help WORDS searches: nerf help blurry, nerf help learning rate.
 python -m nerf_lightning is the same."""
-USAGE_ERROR = 2
-INTERRUPTED = 130
 MOST_LETTERS = 5000
 
 
@@ -200,4 +199,4 @@ def _complain(message: str) -> None:
     # Names from files may contain anything: none of their escape sequences reaches the terminal, and none of their
     # lines looks like ours. Some messages of libraries have several lines.
     print(f"nerf: {for_terminal(message.replace(chr(10), ' '), MOST_LETTERS)}", file=sys.stderr)
-    sys.exit(USAGE_ERROR)
+    sys.exit(BAD_INPUT)

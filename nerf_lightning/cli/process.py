@@ -18,11 +18,8 @@ from io import TextIOWrapper
 from types import FrameType
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.exit_codes import BAD_INPUT, FAILED, READER_LEFT
 
-FAILED = 1
-BAD_INPUT = 2
-READER_LEFT = 141
-"""128 + SIGPIPE, as a shell reports for `yes`; a sweep treats it as a stop, not as a failed job."""
 STDOUT, STDERR = 1, 2
 SETTINGS = {
     ".numba_config.yaml": "numba, whose settings can be given as variables (NUMBA_...)",

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
@@ -23,6 +23,7 @@ from nerf_lightning.export.base import Export, Neutral, RunContext
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
@@ -36,6 +37,7 @@ from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.recorded_path import RecordedPath
+from nerf_lightning.video.settings import Corner, crop_corners
 from nerf_lightning.video.shots import Subject, content_of, frame_around
 
 Keyframes = tuple[dict[str, Any], ...]
@@ -54,6 +56,9 @@ def export(config: DictConfig) -> list[Path]:
         return []
     what: Export = build_exporter(config, str(HydraConfig.get().runtime.choices.get("what")))
     path = build(config.path) if what.plays_path else None
+    crop = crop_corners(OmegaConf.to_container(config.crop) if OmegaConf.is_config(config.crop) else config.crop)
+    if crop is not None and not what.crops:
+        raise InputError("crop: this exporter writes the whole scene. Use what=page, splats, points or mesh.")
     # In float32, whatever the training precision: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
     if what.needs_density:
@@ -61,7 +66,7 @@ def export(config: DictConfig) -> list[Path]:
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with filled_folder(config.paths.output_dir, default) as folder:
-        written = write_files(what, opened, photographs, path, folder)
+        written = write_files(what, opened, photographs, path, folder, crop)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are the refined ones (refinement=...), not those that were read")
     say_written(*written)
@@ -69,12 +74,19 @@ def export(config: DictConfig) -> list[Path]:
 
 
 def write_files(
-    what: Export, opened: LoadedModel, photographs: Scene | None, path: CameraPath | None, folder: Path
+    what: Export,
+    opened: LoadedModel,
+    photographs: Scene | None,
+    path: CameraPath | None,
+    folder: Path,
+    crop: tuple[Corner, Corner] | None = None,
 ) -> list[Path]:
-    """Export an opened model into an existing folder and return the files."""
+    """Export an opened model, or the part of it between the corners of `crop`, into an existing folder."""
     record = opened.checkpoint.scene
     content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
     run = run_context(opened, photographs, path if what.plays_path else None, content)
+    if crop is not None:
+        run = replace(run, crop=CropBox.from_user(*crop, record.to_user))
     if opened.model.needs_photographs:
         record = scene_record(scene_to_look_at(opened, None))
     with torch.no_grad():

@@ -10,17 +10,13 @@ from nerf_lightning.compute import ranks, xla_device
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.compute.devices import Accelerator, choose_device, prepare_machine, working_device
 from nerf_lightning.compute.precision import Precision, choose_precision, suited
+from nerf_lightning.compute.tile_size import bounded_tile_points, default_tile_points
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.models.base import Model
 
 Launcher = Literal["nerf", "torchrun", "slurm"]
 PRODUCTS: dict[str, MatmulPrecision] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
-CPU_TILE_POINTS = 8_192
-GPU_TILE_POINTS = 1 << 20
-MOST_CPU_TILE_POINTS = 1 << 18
-MOST_GPU_TILE_POINTS = 1 << 22
-LEAST_TILE_POINTS = 1 << 10
 
 
 class ComputeSettings:
@@ -41,10 +37,9 @@ class ComputeSettings:
         self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         self._chosen = choose_precision(precision, self.device_type)
         self.precision, self.reason = self._chosen
-        default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
         # XLA would have to compile each size first.
         self.measures_tile = tile_points == "auto" and self.device_type != "xla"
-        self.tile_points = default_tile if tile_points == "auto" else tile_points
+        self.tile_points = default_tile_points(self.device_type) if tile_points == "auto" else tile_points
         self.num_threads, self.devices = num_threads, devices
 
     def prepare_machine(self) -> None:
@@ -60,9 +55,7 @@ class ComputeSettings:
     def keep_tile(self, measured: int | None) -> None:
         """Use the tile that a run has measured, unless the user gave one; on a CPU no larger than is ever tried."""
         if self.measures_tile and measured is not None:
-            # The number comes from a file: tiny tiles take hours, huge ones all the memory.
-            most = MOST_CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
-            self.tile_points = min(max(measured, LEAST_TILE_POINTS), most)
+            self.tile_points = bounded_tile_points(measured, self.device_type)
 
     @property
     def device(self) -> torch.device:
@@ -74,7 +67,7 @@ class ComputeSettings:
     @property
     def inference_tile_points(self) -> int:
         """Maximum number of points at once when rendering without gradients."""
-        return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
+        return self.tile_points or default_tile_points(self.device_type)
 
     def prepare(self, model: Model) -> Model:
         """Move a model to the device, set its fields' precision to the one that suits both, and return it."""

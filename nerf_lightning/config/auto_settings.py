@@ -1,6 +1,6 @@
-"""What `nerf train` chooses for a scene where the user leaves it open: model, time, what comes before and after.
+"""What `nerf train` chooses for a scene if the user does not: model, time, and what comes before and after.
 
-Each choice is said in one line, with the setting that makes another.
+Each choice is logged in one line, with the setting that changes it.
 """
 
 import copy
@@ -21,13 +21,13 @@ from nerf_lightning.nerf.types.scene import Scene
 AUTO = "auto"
 EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 CPU_SECONDS = 300
-"""Of training on a CPU where no length is given: with cameras, evaluation and film about ten minutes on two cores."""
+"""Seconds of training on a CPU if no length is given; with cameras, evaluation and film ten minutes on two cores."""
 PAGE_SECONDS, PAGE_FROM = 100, 100
-"""What the page of a scene takes of CPU_SECONDS, and the shortest training of photographs after which it is written."""
+"""Seconds of CPU_SECONDS that are left for the page of a scene; the shortest training after which it is written."""
 SHORT_SECONDS, SHORT_GPU_SECONDS = 100, 10
-"""In less time, more and cheaper steps are worth more than finer grids."""
+"""In shorter runs, more and cheaper steps are worth more than finer grids."""
 FEW_PHOTOGRAPHS = 30
-"""To train on: fewer tell no finer grid what is true, unless known distances do."""
+"""Training views; fewer do not constrain a finer grid, unless distances are known."""
 TABLE_SIZES = {512: 18, 1024: 18, 2048: 19, 4096: 20}
 """log2 of a hash table's entries, by finest resolution.
 
@@ -35,21 +35,21 @@ After 300 s the fox has 32.20 dB with a resolution of 2048 and 2^19 entries, and
 """
 
 RENDERED_PER_SECOND = 60_000
-"""Rays that fast_proposal renders on two cores; so many for each second of half the budget are evaluated."""
+"""Rays that fast_proposal renders on two cores; evaluation takes as many as this allows in half of the budget."""
 FEWEST_EVALUATED = 3
 
 LONGEST_SETTING, GPU_LONGEST = "scene.longest", 1600
 STEPS_SETTING = "model.levels.fine.sampler.num_steps"
 RAYS_SETTING = "model.subpixels"
 GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
-"""Who has typed one of them has chosen the grid."""
+"""Settings that choose the grid if the user types one of them."""
 SETTLED = (
     *("encoder.max_resolution", "encoder.log2_table_size", "field.color_layers"),
     *(STEPS_SETTING, RAYS_SETTING, "data.batch_rays", "data.sample_budget"),
 )
-"""What model=auto may set beside the model and the loss."""
+"""What model=auto may set besides the model and the loss."""
 LARGE, LARGE_CELLS = "fast_large", 1024
-"""The model of a scene in a box on a GPU, whose pixels are as small as the cells of so fine a grid, or smaller."""
+"""The model for large pictures of a scene in a box on a GPU, and the finest grid from which pictures are large."""
 SHORT_STEPS, LARGE_STEPS, LARGE_TABLE = 576, 1024, 20
 """For large pictures of a scene in a box: steps across it, and log2 of a hash table's entries.
 
@@ -61,7 +61,7 @@ GPU_BATCHES = {
     LARGE: {"data.batch_rays": 65_536, "data.sample_budget": 1 << 18},
     "fast_proposal": {"data.batch_rays": 4_096},
 }
-"""About 2^18 samples a step, as instant-ngp takes: a GPU needs as long for a step of less, which it begins slowly."""
+"""About 2^18 samples per step, as in instant-ngp: on a GPU, a smaller step takes as long."""
 
 log = logging.getLogger(__name__)
 
@@ -69,9 +69,9 @@ log = logging.getLogger(__name__)
 def with_longest(
     config: DictConfig, overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None
 ) -> DictConfig:
-    """Return the config with the size of photographs that a GPU has time for, unless a person has typed one.
+    """Return the config with the size of photographs that a GPU has time for, unless the user has typed one.
 
-    A run that is gone on with (`former`: its config) keeps its own.
+    A resumed run (`former`: its config) keeps its own.
     """
     begun = None if former is None else _number(former, LONGEST_SETTING)
     if "longest" not in config.scene or LONGEST_SETTING in map(key_of, overrides) or not (begun or on_gpu):
@@ -96,13 +96,13 @@ def resolve_auto(
     device_type: str = "cpu",
     former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
-    """Return the config in which nothing is left open, and the names picked from each group.
+    """Return the config with every choice made, and the names picked from each group.
 
-    `choices` are those picked so far, and `overrides` what the config was composed with. A run that is gone on with
-    (`former`: its config) keeps what was chosen for it, on whatever device and for however long.
+    `choices` are those picked so far, and `overrides` what the config was composed with. A resumed run
+    (`former`: its config) keeps what was chosen for it, on any device and for any length.
 
-    The length of a run is what is typed: `trainer.max_steps` or `trainer.max_epochs`, `budget.seconds`, or both, and
-    then the shorter. Where neither is, a run takes CPU_SECONDS on a CPU, and the model's published steps elsewhere.
+    The length of a run is what is typed: `trainer.max_steps` or `trainer.max_epochs`, `budget.seconds`, or the shorter
+    of both. Without either, a run takes CPU_SECONDS on a CPU, and the model's published steps on other devices.
 
     Raises:
         InputError: a setting that is neither a value nor auto.
@@ -137,13 +137,13 @@ def resolve_auto(
 
 
 def _writes_page(config: DictConfig, choices: Mapping[str, Any], is_capture: bool, seconds: int | float | None) -> bool:
-    """Return whether the page of the scene is written although nobody has asked for it."""
+    """Return whether the page of the scene is written although it was not requested."""
     photographs = is_capture and choices.get("model") == PHOTOGRAPHS and config.final.page == AUTO
     return photographs and seconds is not None and seconds >= PAGE_FROM and "page" in option_names("what")
 
 
 def _views_for(scene: Scene, config: DictConfig) -> int | None:
-    """Return how many held-out views a CPU evaluates within half the time that it trains, and say so; None: all."""
+    """Return how many held-out views a CPU evaluates within half of the training time, and log it; None: all."""
     if config.budget.seconds is None or not config.final.evaluate:
         return None
     views = list(scene.splits.get(config.evaluation.split, ()))
@@ -162,7 +162,7 @@ def _views_for(scene: Scene, config: DictConfig) -> int | None:
 
 
 def _number(config: Mapping[str, Any], key: str) -> int | float | None:
-    """Return a positive number of a config that may come from anybody; None where there is none."""
+    """Return a positive number of an untrusted config; None if there is none."""
     value = leaves(config).get(key)
     return value if isinstance(value, int | float) and value > 0 else None
 
@@ -179,8 +179,8 @@ def fit_model(
 ) -> tuple[DictConfig, Mapping[str, Any]]:
     """Return a command's config with what model=auto means for a scene, if it was chosen, and the names picked.
 
-    `seconds` of training; None: nobody has said. `former` is the config of a run that is gone on with. What a person
-    has typed stays.
+    `seconds` of training; None: unknown. `former` is the config of the run that is resumed. What the user has typed
+    stays.
     """
     if choices.get("model") != AUTO:
         return config, choices
@@ -193,14 +193,14 @@ def fit_model(
 def settled(config: Mapping[str, Any]) -> list[str]:
     """Return the overrides that repeat the numbers that model=auto has chosen for a run, by the run's config.
 
-    A section that is not there, and whatever is no whole number, is passed over: the config may come from anybody.
+    Missing sections and values that are not integers are skipped: the config is untrusted.
     """
     values = leaves(config)
     return [f"{key}={values[key]}" for key in SETTLED if type(values.get(key)) is int]
 
 
 def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
-    """Return the model that suits a scene, with what suits the model, and say so."""
+    """Return the model that suits a scene, with what suits the model, and log it."""
     name, reason = model_for(scene)
     large = _has_large_pictures(scene)
     if large and on_gpu:
@@ -217,7 +217,7 @@ def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: in
 
 
 def _as_begun(scene: Scene, overrides: Sequence[str], former: Mapping[str, Any]) -> list[str]:
-    """Return the model of a run that is gone on with, and the numbers that were chosen for it."""
+    """Return the model of a run that is resumed, and the numbers that were chosen for it."""
     typed, name = set(map(key_of, overrides)), model_for(scene)[0]
     numbers = [each for each in settled(former) if key_of(each) not in typed]
     if _has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
@@ -231,7 +231,7 @@ def _has_large_pictures(scene: Scene) -> bool:
 
 
 def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
-    """Return the steps, grid and layers that suit large pictures of a scene in a box; what a person has typed stays."""
+    """Return the steps, grid and layers that suit large pictures of a scene in a box; what the user has typed stays."""
     typed, suited = set(map(key_of, overrides)), []
     if STEPS_SETTING not in typed:
         steps = SHORT_STEPS if short else LARGE_STEPS
@@ -261,7 +261,7 @@ def _rays(overrides: Sequence[str]) -> list[str]:
 
 
 def _grid(resolution: int, table: int, cause: str) -> list[str]:
-    """Return the overrides for a hash grid, and say why."""
+    """Return the overrides for a hash grid, and log why."""
     log.info(
         "encoder: %d cells per side, %s, and hash tables of 2^%d entries (encoder.max_resolution=N, "
         "encoder.log2_table_size=N)",
@@ -273,7 +273,7 @@ def _grid(resolution: int, table: int, cause: str) -> list[str]:
 
 
 def _grid_for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> list[str]:
-    """Return the grid that suits photographs; what a person has typed stays. `short`: there is little time."""
+    """Return the grid that suits photographs; what the user has typed stays. `short`: whether the run is short."""
     if GRID_SETTINGS & set(map(key_of, overrides)):
         return []
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
@@ -285,7 +285,7 @@ def _grid_for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -
 
 
 def _loss_for(scene: Scene, overrides: Sequence[str]) -> list[str]:
-    """Return the loss that suits photographs, if a person has typed none."""
+    """Return the loss that suits photographs, unless the user has typed one."""
     if scene.depths is None or "loss" in map(key_of, overrides):
         return []
     log.info(
@@ -295,7 +295,7 @@ def _loss_for(scene: Scene, overrides: Sequence[str]) -> list[str]:
 
 
 def _for_gpu(model: str, overrides: Sequence[str]) -> list[str]:
-    """Return the batches of a model on a GPU; what a person has typed stays."""
+    """Return the batches of a model on a GPU; what the user has typed stays."""
     typed = set(map(key_of, overrides))
     larger = [f"{key}={value}" for key, value in GPU_BATCHES[model].items() if key not in typed]
     if larger:
@@ -310,10 +310,10 @@ def resolve_correction(
     finding: str | None = None,
     former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
-    """Return the config and the names picked from each group, with the correction that the photographs want.
+    """Return the config and the names picked from each group, with the correction that the photographs need.
 
-    `finding` is what the doctor says of their exposure, None: nothing. A run that is gone on with (`former`: its
-    config) keeps the one that was chosen for it.
+    `finding` is what the doctor says of their exposure; None: nothing. A resumed run (`former`: its config) keeps its
+    own.
     """
     picked = chosen(choices)
     if picked.get("correction") != AUTO:

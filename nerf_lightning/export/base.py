@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
@@ -35,6 +36,8 @@ class RunContext:
     """A camera path as in a keyframe file, in the capture's own frame; each keyframe is a complete camera."""
     name: str = ""
     """Display name of the scene; empty: that of its record."""
+    crop: CropBox | None = None
+    """The part of the scene to export; None: all of it."""
 
 
 MODEL_ALONE = RunContext()
@@ -50,6 +53,8 @@ class Export(ABC):
     """Whether it needs the camera path of the config (`run.keyframes`)."""
     needs_density: bool = True
     """Whether it needs the density, not only renders."""
+    crops: bool = False
+    """Whether it can export a part of the scene (`run.crop`)."""
     kernels: tuple[str, ...] = ()
     """Full names of the modules of compiled kernels that it uses, each with a `trial`: compiled at installation."""
 

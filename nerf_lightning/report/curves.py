@@ -29,6 +29,8 @@ class Chart:
     is_logarithmic: bool = False
     is_noisy: bool = False
     """Whether a smoothed curve is drawn as well."""
+    from_zero: bool = False
+    """Whether the axis begins at zero."""
 
 
 # Only names of these forms are drawn: others may be anything.
@@ -36,8 +38,8 @@ CHARTS = (
     Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)"), is_noisy=True),
     Chart("Training loss", re.compile(r"Training loss/(\w{1,40})"), is_logarithmic=True, is_noisy=True),
     Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
-    Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True),
-    Chart("Memory (GB)", re.compile(r"memory/(\w{1,40})_gigabytes")),
+    Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True, from_zero=True),
+    Chart("Memory (GB)", re.compile(r"memory/(\w{1,40})_gigabytes"), from_zero=True),
 )
 
 
@@ -47,6 +49,7 @@ class Drawing(NamedTuple):
     label: str
     is_logarithmic: bool
     is_noisy: bool
+    from_zero: bool
     curves: list[dict[str, Any]]
     """Each with its `label`, `steps` and `values`."""
     note: str
@@ -69,7 +72,7 @@ def curve_drawings(curves: Mapping[str, Curve]) -> list[Drawing]:
             more = len(drawn) - MOST_CURVES
             note = f"{more} more curves are in the run's TensorBoard files." if more > 0 else ""
             shown = drawn[:MOST_CURVES]
-            drawings.append(Drawing(chart.label, chart.is_logarithmic, chart.is_noisy, shown, note))
+            drawings.append(Drawing(chart.label, chart.is_logarithmic, chart.is_noisy, chart.from_zero, shown, note))
     return drawings
 
 

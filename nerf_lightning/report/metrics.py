@@ -22,11 +22,11 @@ FORMATS = {
     "seconds": "{:.3f}",
 }
 LABELS = {
-    "cc_psnr": "PSNR, colors fitted",
+    "cc_psnr": "PSNR with fitted colors",
     "ssim": "SSIM",
     "lpips": "LPIPS",
-    "depth_error": "depth error, scene units",
-    "normal_error": "surface normals off by",
+    "depth_error": "mean depth error (scene units)",
+    "normal_error": "mean error of surface normals",
 }
 WITHOUT_LPIPS = "not computed (evaluation.lpips=alex)"
 MOST_VIEWS = 12
@@ -38,9 +38,9 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     """Return the numbers on top of a page."""
     median, worst = mapping(metrics.get("median")), mapping(mapping(metrics.get("worst")).get("psnr"))
     shown = [
-        ("PSNR, mean", _shown("psnr", metrics.get("psnr"))),
-        ("PSNR, median", _shown("psnr", median.get("psnr"))),
-        ("PSNR, worst", _shown("psnr", worst.get("value"))),
+        ("PSNR (mean)", _shown("psnr", metrics.get("psnr"))),
+        ("PSNR (median)", _shown("psnr", median.get("psnr"))),
+        ("PSNR (worst view)", _shown("psnr", worst.get("value"))),
         *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
     ]
     count, of = number(metrics.get("num_images")), number(metrics.get("split_views"))
@@ -51,10 +51,10 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     shown.append(("training", "" if trained is None else spoken(trained)))
     for label, value, form in (
         ("frames per second", metrics.get("frames_per_second"), "{:.3g}"),
-        ("memory, GB at most", metrics.get("peak_memory_gigabytes"), "{:.2f}"),
+        ("peak memory", metrics.get("peak_memory_gigabytes"), "{:.2f} GB"),
         ("steps", note.get("finished_at_step"), "{:,.0f}"),
         ("parameters", origin.get("parameters"), "{:,.0f}"),
-        ("weights, MB", origin.get("megabytes"), "{:.1f}"),
+        ("size of the weights", origin.get("megabytes"), "{:.1f} MB"),
     ):
         known = number(value)
         shown.append((label, "" if known is None else form.format(known)))

@@ -98,6 +98,7 @@ function draw(figure, chart) {
   let low = all[Math.floor(0.005 * all.length)], high = all[Math.ceil(0.995 * all.length) - 1];
   const margin = 0.05 * (high - low) || 0.05 * Math.abs(high) || 1;
   low -= margin; high += margin;
+  if (chart.from_zero) low = 0;
   const x = step => LEFT + (step - first) / (last - first) * (width - LEFT - RIGHT);
   const y = value => TOP + (high - Math.min(high, Math.max(low, value))) / (high - low) * (HEIGHT - TOP - BOTTOM);
 
@@ -113,6 +114,8 @@ function draw(figure, chart) {
   curves.forEach((curve, number) => {
     const points = line => line.map((value, k) => `${x(curve.steps[k]).toFixed(1)},${y(value).toFixed(1)}`).join(" ");
     const stroke = COLORS[number % COLORS.length];
+    if (curve.steps.length <= 12)
+      curve.raw.forEach((value, k) => put(svg, "circle", {cx: x(curve.steps[k]), cy: y(value), r: 2.5, fill: stroke}));
     if (curve.line !== curve.raw) put(svg, "polyline", {class: "raw", stroke, points: points(curve.raw)});
     put(svg, "polyline", {stroke, points: points(curve.line)});
   });

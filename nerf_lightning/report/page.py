@@ -40,8 +40,12 @@ class Report:
     """What is said of a page that is older than the last checkpoint."""
     exports: Pairs = field(default_factory=list)
     """Files for other programs: label and address."""
+    result: str = ""
+    """The result in a sentence, with what would improve it most; empty: unknown."""
     facts: Pairs = field(default_factory=list)
-    """The numbers on top: label and value."""
+    """The main numbers: label and value."""
+    more_facts: Pairs = field(default_factory=list)
+    """Further numbers, folded."""
     missing: list[str] = field(default_factory=list)
     """What could not be shown, and why."""
     worst: list[ViewOnPage] = field(default_factory=list)

@@ -24,7 +24,9 @@ from nerf_lightning.runs.summary import read_run as read_summary
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
-SPLITS = {"train": "training", "test": "test"}
+MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
+"""Labels of the numbers that are not folded."""
+SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
 VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
 EARLIER = "of an earlier checkpoint"
@@ -118,8 +120,10 @@ def _is_older(file: Path, run: Path) -> bool:
 
 def _add_measured(report: Report, run: Path, file: Path) -> None:
     metrics, note = read_json_object(file), read_note(run)
-    report.subtitle = f"{run.absolute()}, started {note.get('started', 'at an unknown time')}"
-    report.facts = facts(metrics, note)
+    report.subtitle = f"{run.absolute()}, started {str(note.get('started', 'at an unknown time')).replace('T', ' ')}"
+    known = facts(metrics, note)
+    report.facts = [pair for pair in known if pair[0] in MAIN]
+    report.more_facts = [pair for pair in known if pair[0] not in MAIN]
     report.columns, report.per_image = per_image(metrics)
     report.split = str(mapping(metrics.get("protocol")).get("split", "test"))[:20]
     report.tables = tables(metrics)
@@ -153,8 +157,9 @@ def _add_coverage(report: Report, run: Path) -> None:
     record = checkpoint.scene
     name = scene_name({"scene": record.name}, checkpoint.choices, read_summary(run).overrides)
     report.title = name
-    views = " and ".join(
-        f"{len(record.splits[split])} {split_name}" for split, split_name in SPLITS.items() if record.splits.get(split)
-    )
-    report.subtitle = f"{checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
+    held = {split: record.splits.get(split, ()) for split in SPLITS}
+    if held["val"] == held["test"]:
+        del held["val"]
+    views = ", ".join(f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers)
+    report.subtitle = f"model {checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
     report.coverage = embedded(coverage_picture(record).numpy())

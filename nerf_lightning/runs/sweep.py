@@ -22,6 +22,7 @@ from nerf_lightning.config.overrides import to_type
 from nerf_lightning.files.made_folders import remove_empty
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
+from nerf_lightning.messages.exit_codes import OF_SIGNALS
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
@@ -101,7 +102,7 @@ def watched(run: Callable[[], None]) -> None:
     if error is not None and (not bad or isinstance(error, InputError)):
         raise error
     if _begun and _begun[-1].received is not None:
-        raise SystemExit(128 + _begun[-1].received)
+        raise SystemExit(OF_SIGNALS + _begun[-1].received)
     if bad:
         _complain(bad, len(records), error)
 

@@ -64,7 +64,9 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         _check_alpha(config, outputs)
     require_one_of(get_args(Projection), projection=config["projection"])
     plain = {name: config[name] for name in (*SWITCHES, "projection")}
-    return FilmSettings(outputs, form=config["format"], near=_near(config["near"]), crop=_crop(config["crop"]), **plain)
+    return FilmSettings(
+        outputs, form=config["format"], near=_near(config["near"]), crop=crop_corners(config["crop"]), **plain
+    )
 
 
 def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
@@ -97,7 +99,12 @@ def _near(value: Any) -> float | None:
     return float(value)
 
 
-def _crop(corners: Any) -> tuple[Corner, Corner] | None:
+def crop_corners(corners: Any) -> tuple[Corner, Corner] | None:
+    """Return the lower and the upper corner of a box in the capture's own frame; None: there is no box.
+
+    Raises:
+        InputError: it is no box.
+    """
     if corners is None:
         return None
     if not isinstance(corners, list) or len(corners) != 2 or not all(map(is_point, corners)):

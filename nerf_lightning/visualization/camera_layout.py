@@ -60,10 +60,11 @@ def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
     axes.imshow(missing, cmap=colors, vmin=0, vmax=1, interpolation="nearest", **placed)
     for split, views in _splits(scene).items():
         at = list(views)
-        axes.scatter(azimuth[at].numpy(), elevation[at].numpy(), s=16, color=COLOURS[split], edgecolors="white", lw=0.4)
+        dots: dict[str, Any] = {"s": 16, "color": COLOURS[split], "edgecolors": "white", "lw": 0.4, "label": split}
+        axes.scatter(azimuth[at].numpy(), elevation[at].numpy(), **dots)
     axes.axhline(0, color="0.6", linewidth=0.7)
-    axes.text(176, 3, "horizon", fontsize=7, color="0.4", ha="right")
-    title = f"coverage: green lies within {NEAR_ENOUGH:.0f} degrees of a photograph, red is missing"
+    axes.legend(loc="lower left", fontsize=7, framealpha=0.8)
+    title = f"coverage: green is within {NEAR_ENOUGH:.0f} degrees of a photograph, red is not"
     axes.set_xticks(range(-180, 181, 45))
     axes.set_yticks(range(-90, 91, 30))
     _style(axes, title, "azimuth around the middle (degrees)", "elevation (degrees)")

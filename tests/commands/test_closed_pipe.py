@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from support.running import FAST_SWEEP, start
 
-from nerf_lightning.cli.process import READER_LEFT, ends_quietly
+from nerf_lightning.cli.process import ends_quietly
+from nerf_lightning.messages.exit_codes import READER_LEFT
 
 
 def unread(*arguments, buffered=True, merged=False):

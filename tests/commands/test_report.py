@@ -5,7 +5,7 @@ import re
 import shutil
 
 import pytest
-from support.browser import opened
+from support.browser import SIZES, layout_faults, opened
 from support.measured_runs import leave_measured_run
 from support.running import finished, said, start
 
@@ -41,7 +41,7 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
 
 
 @pytest.mark.minutes
-def test_sliders_work_videos_play_and_it_fits_a_phone(page_of_run):
+def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
     with opened(page_of_run[0].as_uri(), 1200, 900) as driver:
         run = driver.execute_script
         assert not [entry for entry in driver.get_log("browser") if "favicon" not in entry["message"]]
@@ -82,10 +82,9 @@ def test_sliders_work_videos_play_and_it_fits_a_phone(page_of_run):
         )
         driver.set_script_timeout(60)
         assert driver.execute_async_script(script) == [16, pytest.approx(40, abs=30), 16]
-        phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
-        driver.refresh()
-        assert run("return document.documentElement.scrollWidth") == 390
+        unfold = "document.querySelectorAll('details').forEach(each => { each.open = true; })"
+        for size in SIZES:
+            assert layout_faults(driver, size) == layout_faults(driver, size, unfold) == []
 
 
 def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):

@@ -116,3 +116,43 @@ def unfold(driver, title: str, inside: str, seconds: float = 60.0) -> None:
                     return
             time.sleep(0.1)
         assert time.monotonic() < end, f"{title} does not open"
+
+
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+LAYOUT = """
+const seen = element => { const box = element.getBoundingClientRect(); return box.width > 0 && box.height > 0; };
+const faults = [], wide = document.documentElement.scrollWidth;
+if (wide > innerWidth) faults.push(`it is ${wide} pixels wide, in a window of ${innerWidth}`);
+for (const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT); walker.nextNode();) {
+  const element = walker.currentNode.parentElement, text = walker.currentNode.textContent.trim();
+  if (!text || !seen(element) || element.closest("script, style, option")) continue;
+  if (parseFloat(getComputedStyle(element).fontSize) < 10) faults.push(`small text: ${text.slice(0, 40)}`);
+}
+const controls = [...document.querySelectorAll("button, input, select, summary, a.button")].filter(seen);
+const name = element => element.id || element.textContent.trim().slice(0, 20) || element.type;
+controls.forEach((one, number) => controls.slice(number + 1).forEach(other => {
+  if (one.contains(other) || other.contains(one)) return;
+  const [a, b] = [one, other].map(element => element.getBoundingClientRect());
+  const width = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+  const height = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+  if (width > 1 && height > 1) faults.push(`${name(one)} lies over ${name(other)}`);
+}));
+return faults;
+"""
+
+
+def layout_faults(driver, size: str, prepare: str = "") -> list[str]:
+    """Return what is wrong with a page in a window of this size: sideways scrolling, small text, controls that overlap.
+
+    Args:
+        driver: shows the page.
+        size: of `SIZES`.
+        prepare: a script to run before looking.
+    """
+    width, height = SIZES[size]
+    window = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": size == "phone"}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", window)
+    driver.refresh()
+    time.sleep(0.5)
+    driver.execute_script(prepare)
+    return driver.execute_script(LAYOUT)

@@ -17,6 +17,7 @@ from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.exit_codes import OF_SIGNALS
 from nerf_lightning.nerf.models.tiles import is_device_failure
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
@@ -59,7 +60,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         log.info("%d step%s in %s", steps, "s" * (steps != 1), spoken(job.clock.seconds))
     if job.signals.received is not None:
         log.info("stopped at step %d; resume with: %s", trainer.global_step, resume_command(folder.path))
-        raise SystemExit(128 + job.signals.received)
+        raise SystemExit(OF_SIGNALS + job.signals.received)
     return trainer
 
 

@@ -63,8 +63,10 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
     if job.config.final.report:
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
-        write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(_result(job, target, psnr, trainer.global_step))
+        report = read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine)
+        report.result = _result(job, folder, psnr, trainer.global_step)
+        write_report(report, target)
+        say(f"result       {target}: {report.result}")
     say(f"look at it   {_program()} view {to_type('ckpt', str(folder))} {trust_setting(job)}".rstrip())
 
 
@@ -74,18 +76,18 @@ def _program() -> str:
     return "nerf" if shutil.which("nerf") or not beside.is_file() else os.path.relpath(beside)
 
 
-def _result(job: TrainJob, page: Path, psnr: float | None, steps: int) -> str:
-    """Return the last line: the page, the result, and what would improve it most."""
+def _result(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> str:
+    """Return the result in a sentence, and what would improve it most."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
     quality = "" if psnr is None else f"{psnr:.1f} dB on held-out {what}, "
     length = (
         f"trainer.max_steps={2 * steps}" if seconds is None else f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
     )
-    cure = f"train longer ({resume_command(page.parent)} {length})."
-    if not _still_learns(job, page.parent, psnr, steps):
+    cure = f"train longer ({resume_command(folder)} {length})."
+    if not _still_learns(job, folder, psnr, steps):
         cure = advice(job.checks or ()) or cure
-    return f"result       {page}: {quality}{used} of {total} {what} used. To improve it, {cure[0].lower()}{cure[1:]}"
+    return f"{quality}{used} of {total} {what} used. To improve it, {cure[0].lower()}{cure[1:]}"
 
 
 def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> bool:

@@ -19,6 +19,7 @@ from nerf_lightning.extensions.geometry_exports.mesh_files import require_librar
 from nerf_lightning.extensions.geometry_exports.surface import surface_level
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -107,6 +108,21 @@ def without_cavities(
     volumes = (a * np.cross(b, c)).sum(axis=1) / 6.0
     part = _part_of_face(len(vertices), faces)
     return _only(vertices, faces[(np.bincount(part, volumes) > 0)[part]])
+
+
+def in_box(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], box: CropBox
+) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"]]:
+    """Return the faces with all corners in a crop box.
+
+    Raises:
+        InputError: there is none.
+    """
+    inside = box.holds(torch.from_numpy(vertices)).numpy()
+    faces = faces[inside[faces].all(axis=1)]
+    if not len(faces):
+        raise InputError("crop: there is no surface in this box. Its corners are in the capture's own frame.")
+    return _only(vertices, faces)
 
 
 def _part_of_face(size: int, faces: Int[ndarray, "faces 3"]) -> Int[ndarray, "faces"]:

@@ -23,6 +23,7 @@ from nerf_lightning.export.base import (
 from nerf_lightning.extensions.geometry_exports import density_mesh, fused_mesh
 from nerf_lightning.extensions.geometry_exports.density_grid import Lattice, require_resolution
 from nerf_lightning.extensions.geometry_exports.density_mesh import (
+    in_box,
     mesh_of_density,
     seen_faces,
     without_cavities,
@@ -91,6 +92,7 @@ class MeshExport(Export):
             textured OBJ comes with an MTL and a PNG.
     """
 
+    crops = True
     kernels = (f"{__package__}.tsdf_fusion", f"{__package__}.texels")
 
     resolution: int = 256
@@ -137,6 +139,8 @@ class MeshExport(Export):
     ) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
+        if run.crop is not None and self.format == "stl":
+            raise InputError("what.format=stl asks for a closed mesh, which a crop box opens. Leave one of them out.")
         beside = ("mtl", "png") if self.texture and self.format == "obj" else ()
         require_free(child_of(folder, f"mesh.{ending}") for ending in (self.format, *beside))
         require_library("trimesh")  # before the work, not after it
@@ -146,6 +150,8 @@ class MeshExport(Export):
             require_texture_room(self.texture_size)
         with StageProgress(COSTS[self.surface] | COLORING[self.texture]) as report:
             vertices, faces = self._surface(model, record, lattice, tile_points, report)
+            if run.crop is not None:
+                vertices, faces = in_box(vertices, faces, run.crop)
             vertices, faces = self._cleaned(vertices, faces)
             if self.format == "stl":
                 return save_solid(folder / "mesh.stl", in_millimeters(vertices, record), faces)

@@ -55,6 +55,8 @@ class PointsExport(Export):
             normals, which needs `pip install '.[las]'`.
     """
 
+    crops = True
+
     num_points: int = 1_000_000
     max_views: int = 100
     longest: int = 400
@@ -108,6 +110,10 @@ class PointsExport(Export):
         if not len(cloud):
             raise InputError(self._nothing(record, min(opacities), max(opacities), candidates))
         log.info("%d of %d points are confirmed by other views", len(cloud), candidates)
+        if run.crop is not None:
+            cloud = cloud[run.crop.holds(cloud[:, :3])]
+            if not len(cloud):
+                raise InputError("crop: there are no points in this box. Its corners are in the capture's own frame.")
         return [self._save(cloud, record, folder)]
 
     def _save(self, cloud: Float[Tensor, "points 9"], record: SceneRecord, folder: Path) -> Path:

@@ -46,7 +46,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
         found = [_numbers(islice(lines, 3), 1, 3, path) for _ in range(points)]
     if count != len(names):
         raise InputError(
-            f"{path} has {count} cameras, but the list beside it names {len(names)} pictures. Export both again."
+            f"{path} has {count} cameras, but the list next to it names {len(names)} pictures. Export both again."
         )
     posed = {f"camera {number}": pair for number, pair in enumerate(zip(names, cameras, strict=True)) if pair[1][0]}
     capture = reader.posed(path, posed, _posed, path.parent, points=sparse_points(found, path))
@@ -57,7 +57,7 @@ def _read(reader: PosedReader, path: Path) -> Capture:
 def _names(path: Path) -> list[str]:
     found = next((name for pattern in LISTS if (name := file_with(path.parent, (pattern, "")))), None)
     if found is None:
-        raise InputError(f"{path} of Bundler needs a list of its pictures beside it, such as list.txt.")
+        raise InputError(f"{path} of Bundler needs a list of its pictures next to it, such as list.txt.")
     lines = read_text(path.parent / found, "text", CURE).splitlines()
     return [_name(line.strip()) for line in lines if line.strip()]
 

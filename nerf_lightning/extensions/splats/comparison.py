@@ -33,8 +33,7 @@ class Comparison:
         said = f"{self.splats['psnr']:.2f} dB on {self.views}"
         if self.field is None:
             return f"{said}, with the field's renders as the truth"
-        gain = self.splats["psnr"] - self.field["psnr"]
-        said += f", the field {self.field['psnr']:.2f} dB: {abs(gain):.2f} dB {'gained' if gain >= 0 else 'lost'}"
+        said += f", the field {self.field['psnr']:.2f} dB"
         return (
             said
             if self.field["ssim"] is None

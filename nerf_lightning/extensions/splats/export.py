@@ -21,7 +21,7 @@ from nerf_lightning.extensions.splats.files import (
     require_library,
     save_splats,
 )
-from nerf_lightning.extensions.splats.fitted import SplatFitting
+from nerf_lightning.extensions.splats.fitted import SplatFitting, cropped
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import StageProgress, say
@@ -70,10 +70,10 @@ class SplatsExport(SplatFitting):
             found = self.fitted(model, record, run, tile_points, report)
             chosen = record.background, self.max_views, tile_points
             comparison = compared(found, found.gaussians, model, *chosen, report)
-        to_file = self._to_file(record)
+        shown, to_file = cropped(found.gaussians, run), self._to_file(record)
         pinholes = record.cameras.lens_model != "equirectangular"
-        save_splats(path, moved(found.gaussians, to_file), moved_cameras(record.cameras, to_file) if pinholes else None)
-        known: dict[str, Any] = {"splats": len(found.gaussians), "bytes": path.stat().st_size}
+        save_splats(path, moved(shown, to_file), moved_cameras(record.cameras, to_file) if pinholes else None)
+        known: dict[str, Any] = {"splats": len(shown), "bytes": path.stat().st_size}
         known |= {"seconds": round(time.monotonic() - began, 1), "fitting_seconds": self.seconds}
         known |= {"fitted_to": found.truth, "views": comparison.views}
         known |= {"splats_metrics": comparison.splats} | (

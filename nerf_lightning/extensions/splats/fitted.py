@@ -11,6 +11,7 @@ from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians
 from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
 from nerf_lightning.extensions.splats.views import View, photographed, without_lens
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.panoramas import faces_of_panoramas
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
@@ -46,6 +47,7 @@ class SplatFitting(Export):
     """An exporter that fits splats: its settings, and the fitting."""
 
     needs_photographs = True
+    crops = True
     kernels = KERNELS
 
     num_splats: int | Literal["auto"] = "auto"
@@ -97,6 +99,20 @@ class SplatFitting(Export):
     def _budget(self, pinholes: Cameras) -> int:
         pixels = int((pinholes.width * pinholes.height).double().mean())
         return min(PER_SIDE * math.isqrt(pixels), MOST) if self.num_splats == "auto" else self.num_splats
+
+
+def cropped(gaussians: Gaussians, run: RunContext) -> Gaussians:
+    """Return the splats whose centers are in the crop box, if there is one.
+
+    Raises:
+        InputError: none is.
+    """
+    if run.crop is None:
+        return gaussians
+    inside = run.crop.holds(gaussians.means)
+    if not inside.any():
+        raise InputError("crop: there are no splats in this box. Its corners are in the capture's own frame.")
+    return gaussians.map(lambda each: each[inside])
 
 
 def _photographs(record: SceneRecord, run: RunContext) -> Scene | None:

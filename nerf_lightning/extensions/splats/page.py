@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nerf_lightning.export.base import MODEL_ALONE, RunContext, require_setting
 from nerf_lightning.extensions.splats.comparison import compared
-from nerf_lightning.extensions.splats.fitted import SplatFitting
+from nerf_lightning.extensions.splats.fitted import SplatFitting, cropped
 from nerf_lightning.extensions.splats.page_file import write_page
 from nerf_lightning.extensions.splats.page_marks import Marks, read_marks
 from nerf_lightning.extensions.splats.quantized import QuantizedSplats
@@ -68,13 +68,14 @@ class PageExport(SplatFitting):
             if self.max_views:
                 chosen = record.background, self.max_views, tile_points
                 facts = [("PSNR", compared(found, splats.gaussians(), model, *chosen, report).psnr())]
+            splats = splats if run.crop is None else QuantizedSplats.of(cropped(found.gaussians, run))
         known = [*facts, ("splats", f"{splats.splats:,}, fitted to {found.truth} for {self.seconds:g} s")]
         chosen_texts = marks, self.title, self.first_view
         write_page(target, splats, found.focal, record, run, self.photographs, known, *chosen_texts)
         if self.views is not None:
             write_json(folder / MARKS, marks)
-        size = f"{target.stat().st_size / 1e6:.1f} MB"
-        say(*(f"{name:<12} {fact}" for name, fact in [("size", size), *known]))
+        size = ("size", f"{target.stat().st_size / 1e6:.1f} MB")
+        say(*(f"{f'page {name}':<12} {fact}" for name, fact in [size, *known]))
         return [target]
 
     def _marks(self, record: SceneRecord, folder: Path) -> Marks:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from nerf_lightning.extensions.viewer.client import ViewerClient
 
 AWAY_SECONDS = 15.0  # A page that is reloaded is away for a moment; a user who is away for longer has left.
-PAUSE, GO_ON = "Pause", "Go on"
+PAUSE, GO_ON = "Pause", "Resume"
 STOP, SURE = "Stop training", "Really stop: press again"
 SURE_SECONDS = 8.0  # Maximum time until the second press.
 WHAT_STOP_IS = "The checkpoint is written, and the run evaluated."
@@ -81,9 +81,7 @@ class TrainingPanel:
         gui, harmless = session.client.gui, session.queue.errors.harmless
         with gui.add_folder("Training"):
             self.said = gui.add_markdown("")
-            self.hold = gui.add_button(
-                PAUSE, visible=switch.can_pause, hint="Training waits until somebody presses Go on"
-            )
+            self.hold = gui.add_button(PAUSE, visible=switch.can_pause, hint="Training waits until Resume is pressed")
             self.end = gui.add_button(STOP, color="gray", hint=WHAT_STOP_IS)
         self.hold.on_click(harmless(lambda _: switch.go_on() if switch.wants_pause else switch.pause()))
         self.end.on_click(harmless(lambda _: self._stop()))

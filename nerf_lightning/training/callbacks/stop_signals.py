@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
+from nerf_lightning.messages.exit_codes import OF_SIGNALS
 from nerf_lightning.training.launch.preemption import stop_signals
 
 
@@ -43,7 +44,7 @@ class StopSignals(Callback):
                 (`preemption`).
         """
         if ranks.largest(float(trainer.received_sigterm)):
-            raise SystemExit(128 + signal.SIGTERM)
+            raise SystemExit(OF_SIGNALS + signal.SIGTERM)
         self._listen()
 
     def asked_to_stop(self) -> bool:
@@ -72,5 +73,5 @@ class StopSignals(Callback):
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.heard and number == signal.SIGINT:
-            os._exit(128 + number)  # an exception would be caught on the way, and the process would linger
+            os._exit(OF_SIGNALS + number)  # an exception would be caught on the way, and the process would linger
         self.heard, self.received = True, number

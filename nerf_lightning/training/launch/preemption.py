@@ -1,7 +1,7 @@
 """Preemption by a scheduler: stop without losing anything, and have the job started again.
 
 During training, `callbacks/stop_signals.py` finishes the step and saves; before and after it there is nothing to save,
-and the process exits at once. Either way it ends with SystemExit(128 + signal), and this module does the rest:
+and the process exits at once. Either way it ends with SystemExit(OF_SIGNALS + signal), and this module does the rest:
 
 * SIGUSR1 in a Slurm job (sbatch --signal=USR1@90): the job is requeued.
 * The signal of submitit (SIGUSR2 if not configured): submitit's own handler is called, which counts and requeues.
@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from torch import distributed
 
 from nerf_lightning.compute.slurm import requeue
+from nerf_lightning.messages.exit_codes import OF_SIGNALS
 
 
 @contextmanager
@@ -32,7 +33,7 @@ def preemptible() -> Iterator[None]:
         yield
     except SystemExit as stop:
         if wants_restart(stop.code):
-            _restart(int(stop.code or 0) - 128, former)
+            _restart(int(stop.code or 0) - OF_SIGNALS, former)
         raise
     finally:
         for number, handler in former.items():
@@ -42,11 +43,11 @@ def preemptible() -> Iterator[None]:
 def wants_restart(code: Any) -> bool:
     """Return whether an exit code is of a signal after which the run is started again."""
     sent = {submitit_signal()} | ({signal.SIGUSR1} if hasattr(signal, "SIGUSR1") else set())
-    return isinstance(code, int) and code - 128 in sent
+    return isinstance(code, int) and code - OF_SIGNALS in sent
 
 
 def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)
+    raise SystemExit(OF_SIGNALS + number)
 
 
 def _restart(number: int, former: dict[int, Any]) -> None:

@@ -32,6 +32,7 @@ from nerf_lightning.compute.slurm import num_tasks
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.exit_codes import OF_SIGNALS
 
 # The parts of Hydra's own config that a worker may need.
 HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_logging"]
@@ -161,7 +162,7 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
         except ChildFailedError as error:
             raise SystemExit(_exit_code([failure.exitcode for failure in error.failures.values()])) from None
         except SignalException as stopped:
-            raise SystemExit(128 + stopped.sigval) from None
+            raise SystemExit(OF_SIGNALS + stopped.sigval) from None
         return read_json(Path(folder) / "result.json")
 
 
@@ -171,7 +172,7 @@ def end_with(launcher: int) -> None:
     def watch() -> None:
         while os.getppid() == launcher:
             time.sleep(WATCH_SECONDS)
-        os._exit(128 + signal.SIGTERM)
+        os._exit(OF_SIGNALS + signal.SIGTERM)
 
     if os.name == "posix":  # elsewhere a parent's process ID says nothing
         threading.Thread(target=watch, daemon=True).start()
@@ -180,7 +181,7 @@ def end_with(launcher: int) -> None:
 def _exit_code(codes: list[int]) -> int:
     # Negative: killed by a signal, mostly by the launcher after another one had failed.
     own = [code for code in codes if code > 0]
-    return own[0] if own else 128 + signal.SIGTERM
+    return own[0] if own else OF_SIGNALS + signal.SIGTERM
 
 
 @contextmanager

@@ -326,7 +326,7 @@ def test_bundlers_lists_may_name_focal_lengths_and_cameras_without_a_pose(tmp_pa
     assert_known(capture, MIDDLE, (0.1, -0.02, 0, 0, 0, 0))
     assert capture.left_out.without_pose == ("images/unposed.png",)
     (tmp_path / "list.txt").write_text("images/p_0.png\n")
-    with pytest.raises(InputError, match="has 10 cameras, but the list beside it names 1 pictures"):
+    with pytest.raises(InputError, match="has 10 cameras, but the list next to it names 1 pictures"):
         read(tmp_path)
 
 

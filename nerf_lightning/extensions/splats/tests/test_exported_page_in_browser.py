@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.browser import drag, opened
+from support.browser import SIZES, drag, layout_faults, opened
 from support.contracted_hall import hall_model, hall_scene
 from support.page_in_browser import MESSAGE, drawn, drawn_through, press, psnr, shot, wait_for, wait_until_there
 from support.shiny_ball import all_around, read_page, record_of, run_of, shiny_model
@@ -53,6 +53,18 @@ def test_it_shows_what_the_rasterizer_draws_and_asks_for_nothing(page):
         drag(driver, 40, 0)
         wait_for(driver, "still")
         assert psnr(shot(driver), before) < 35
+
+
+@pytest.mark.parametrize("page", [2], indirect=True)
+def test_nothing_overlaps_on_desktops_and_phones(page):
+    with opened(page.as_uri(), 1280, 800) as driver:
+        for size in SIZES:
+            assert layout_faults(driver, size) == []
+            assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
+            before = "document.getElementById('full').getBoundingClientRect()"
+            left = driver.execute_script(f"return {before}.left")
+            driver.execute_script("document.getElementById('tools').open = false")
+            assert driver.execute_script(f"return {before}.left") == left, "opening the tools moves nothing"
 
 
 @pytest.mark.parametrize("page", [2], indirect=True)

@@ -90,8 +90,8 @@ def test_longer_training_is_advised_before_more_photographs_while_it_helps(monke
         checks=[Check("coverage", "look", "a gap", "Take 6 more photographs.")],
         system=SimpleNamespace(model=SimpleNamespace(level_names=("proposal", "fine"))),
     )
-    line = show._result(job, Path("run/report.html"), 20.6, steps)
-    assert line.endswith(f": 20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it, {cure}")
+    line = show._result(job, Path("run"), 20.6, steps)
+    assert line.endswith(f"20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it, {cure}")
 
 
 @pytest.mark.parametrize(("age", "of"), [(-60, "of an earlier checkpoint"), (60, "")])
