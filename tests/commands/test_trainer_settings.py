@@ -4,7 +4,7 @@ import pytest
 import torch
 from support.scenes import tiny_model
 
-from nerf_lightning.compute import precision
+from nerf_lightning.compute import precision, tile_size
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.training.launch.trainer import TrainerSettings

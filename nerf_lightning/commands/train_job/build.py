@@ -1,5 +1,6 @@
 """What `nerf train` adds to a run: callbacks, loggers, the doctor, and what follows the training."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,7 @@ def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
     if job_folder() is not None and asked.final.page == AUTO:
+        asked = copy.deepcopy(asked)
         asked.final.page = False  # the runs of a sweep are compared, not handed over
     job = assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
     if job_folder() is not None:
