@@ -41,7 +41,7 @@ class SplatsExport(SplatFitting):
         seconds: seconds of fitting to the training photographs; without them, to renders of the field; 0: no
             fitting.
         sh_degree: degree of the spherical harmonics of colors, 0 to 3; 0: the same color from everywhere.
-        format: the file format: ply, sog (for the web, an eighth of the size), spz (a sixth), glb (glTF with
+        format: the file format: ply, sog (for the web, a tenth of the size), spz (a sixth), glb (glTF with
             KHR_gaussian_splatting) or usda (OpenUSD 26.03, with the cameras). SPZ needs `pip install '.[splats]'`.
         frame: upright, so that the scene is upright in viewers, or capture, the capture's own axes (GLB and USDA are
             always upright).

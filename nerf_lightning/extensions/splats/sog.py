@@ -23,8 +23,8 @@ from nerf_lightning.extensions.splats.gaussians import Gaussians
 
 CODES = 256
 """Values of a codebook: a byte names one."""
-ROUNDS = 10  # Of Lloyd's algorithm.
-PALETTE, MOST_PALETTE, ROW = 1024, 1 << 14, 64
+ROUNDS, PALETTE_ROUNDS = 10, 4  # Of Lloyd's algorithm.
+PALETTE, MOST_PALETTE, ROW = 1024, 1 << 12, 64
 """Colors that depend on the direction are one of a palette's for every few splats: at least, at most, in a row."""
 SHARED = 4
 ALIKE = 1 << 12  # Splats that are compared with the palette at once.
@@ -118,7 +118,7 @@ def _palette(rows: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "palette k"], In
     size = min(len(rows), MOST_PALETTE, max(PALETTE, len(rows) // SHARED))
     palette = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:size]]
     labels = _nearest(rows, palette)
-    for _ in range(ROUNDS):
+    for _ in range(PALETTE_ROUNDS):
         count = torch.bincount(labels, minlength=size)[:, None]
         sums = torch.zeros_like(palette).index_add_(0, labels, rows)
         palette = torch.where(count > 0, sums / count.clamp(min=1), palette)
