@@ -89,13 +89,6 @@ def require_memory(what: str, size: int, needed: Callable[[int], float], named: 
     )
 
 
-def held_memory(device: torch.device) -> int:
-    """Return how many bytes this process holds now, all libraries included; on a GPU, what torch holds there."""
-    if device.type == "cuda":
-        return torch.cuda.memory_allocated(device)
-    return int(psutil.Process().memory_info().rss)
-
-
 def peak_memory() -> float:
     """Return this process's peak memory so far, in gigabytes; with a GPU, the GPU's."""
     if torch.cuda.is_available():
