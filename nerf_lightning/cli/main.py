@@ -42,6 +42,7 @@ JSON, AS_JSON = "--json", "json=true"
 HELP = """nerf: train radiance fields from photographs and render new views.
 
 usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
+       nerf doctor|table|selftest|bench --json          print the result as JSON
 
 {}
 
@@ -155,9 +156,13 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first, require_settings
         from nerf_lightning.cli.loading import compose_once
+        from nerf_lightning.config.help.catalogue import command_named, known_names
         from nerf_lightning.config.hydra_versions import hydra_main
         from nerf_lightning.config.search_path import search_extensions
 
+        asked = command_named(command)
+        if JSON in arguments and (asked is None or "json" not in known_names(asked)):
+            raise InputError(f"nerf {command} prints no table: {JSON} is for nerf doctor, table, selftest and bench.")
         arguments = options_first([_setting_of(word) for word in arguments], command)
         require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)

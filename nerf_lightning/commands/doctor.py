@@ -18,9 +18,9 @@ from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
-from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.json_files import print_json, write_json
 from nerf_lightning.files.made_folders import child_of
-from nerf_lightning.messages.console import StdoutConsole, say, say_json, say_written, spoken
+from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
@@ -49,7 +49,7 @@ def run(config: DictConfig) -> int:
         save_png(written[-1], proof_picture(scene, proofs))
     wrongs = sum(check.verdict == "wrong" for check in checks)
     if config.json:
-        say_json(result | {"written": written})
+        print_json(result | {"written": written})
         return wrongs
     say(*wrap(f"capture  {about}", terminal_width(UNWRAPPED), subsequent_indent=" " * 9))
     print_checks(checks)

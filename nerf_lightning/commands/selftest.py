@@ -16,8 +16,8 @@ from nerf_lightning import __version__
 from nerf_lightning.compute.precision import has_tf32
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
-from nerf_lightning.files.json_files import write_json
-from nerf_lightning.messages.console import StdoutConsole, say, say_json, say_written, spoken, stderr_console
+from nerf_lightning.files.json_files import print_json, write_json
+from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken, stderr_console
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.command_folder import output_folder
@@ -51,7 +51,7 @@ def run(config: DictConfig) -> None:
     result |= {"checks": [asdict(row) for row in rows]}
     write_json(folder / "selftest.json", result)
     if config.json:
-        say_json(result | {"written": [folder / "selftest.json"]})
+        print_json(result | {"written": [folder / "selftest.json"]})
     else:
         _print(rows, settings.describe(), known, time.perf_counter() - began)
         say_written(folder / "selftest.json")

@@ -7,7 +7,8 @@ from omegaconf import DictConfig, ListConfig
 
 from nerf_lightning.files.folders import PACKAGE
 from nerf_lightning.files.html import write_page
-from nerf_lightning.messages.console import say, say_json, say_written
+from nerf_lightning.files.json_files import print_json
+from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
@@ -33,7 +34,7 @@ def run(config: DictConfig) -> int:
     out = config.out or config.paths.output_dir
     written = _write(rows, notes, title, Path(str(out)), found.measured[0].protocol) if out else []
     if config.json:
-        say_json({"title": title, "rows": rows, "notes": notes, "written": written})
+        print_json({"title": title, "rows": rows, "notes": notes, "written": written})
         return len(rows)
     print_rows(rows, title, "Widen it, or write all columns to files with out=DIR.")
     say(*notes)

@@ -119,9 +119,11 @@ def resolve_auto(
     _settle(config, "doctor", is_capture)
     _settle(config.final, "report", is_capture)
     writes_page = _writes_page(config, choices, is_capture, seconds)
-    if writes_page and config.budget.seconds == AUTO and former is None:
-        seconds = CPU_SECONDS - PAGE_SECONDS
-    if not isinstance(config.final.page, DictConfig):  # else the exporter's settings are typed
+    if writes_page:
+        if config.budget.seconds == AUTO and former is None:
+            seconds = CPU_SECONDS - PAGE_SECONDS
+        log.info("page: after %g s of training, export/page.html is written (final.page=false skips it)", seconds)
+    if not isinstance(config.final.get("page"), DictConfig):  # else the exporter's settings are typed
         _settle(config.final, "page", writes_page)
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
@@ -138,7 +140,7 @@ def resolve_auto(
 
 def _writes_page(config: DictConfig, choices: Mapping[str, Any], is_capture: bool, seconds: int | float | None) -> bool:
     """Return whether the page of the scene is written although it was not requested."""
-    photographs = is_capture and choices.get("model") == PHOTOGRAPHS and config.final.page == AUTO
+    photographs = is_capture and choices.get("model") == PHOTOGRAPHS and config.final.get("page") == AUTO
     return photographs and seconds is not None and seconds >= PAGE_FROM and "page" in option_names("what")
 
 
@@ -333,7 +335,7 @@ def resolve_correction(
 
 
 def _settle(section: DictConfig, key: str, value: bool) -> None:
-    meant = {AUTO: value, "on": True, "off": False, True: True, False: False}
-    if section[key] not in meant:
+    meant = {AUTO: value, "on": True, "off": False, True: True, False: False, None: False}
+    if section.get(key) not in meant:
         raise InputError(f"{key}={section[key]} is not valid: it must be on, off or auto.")
-    section[key] = meant[section[key]]
+    section[key] = meant[section.get(key)]

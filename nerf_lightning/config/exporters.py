@@ -35,8 +35,9 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     Raises:
         InputError: there is no such exporter or setting, or its value makes no sense.
     """
-    asked = {name: value for name, value in final.items() if name not in NO_EXPORTERS and value not in (False, "auto")}
-    return {str(name): _exporter(str(name), value) for name, value in asked.items()}
+    asked = {str(name): value for name, value in final.items() if name not in NO_EXPORTERS}
+    wanted = {name: value for name, value in asked.items() if value not in (False, None, "off", "auto")}
+    return {name: _exporter(name, True if value == "on" else value) for name, value in wanted.items()}
 
 
 def build_exporter(config: DictConfig, name: str) -> Any:

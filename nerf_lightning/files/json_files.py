@@ -89,6 +89,11 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         part.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def print_json(value: object) -> None:
+    """Print a value as JSON to stdout, all of it in ASCII, which steers no terminal."""
+    print(json.dumps(_finite(value), indent=2, default=str, allow_nan=False), flush=True)
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(part) for key, part in value.items()}

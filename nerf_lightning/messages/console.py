@@ -1,6 +1,5 @@
 """Terminal output: lines on stdout, progress bars on stderr."""
 
-import json
 import logging
 import sys
 import time
@@ -134,11 +133,6 @@ def say(*lines: str) -> None:
     """Print lines to stdout; whatever they contain, each stays one line without control characters."""
     if lines:
         print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
-
-
-def say_json(value: object) -> None:
-    """Print a value as JSON to stdout, all of it in ASCII, which steers no terminal."""
-    print(json.dumps(value, indent=2, default=str), flush=True)
 
 
 def say_written(*paths: Path) -> None:

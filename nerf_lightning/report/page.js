@@ -62,7 +62,8 @@ function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = power * [1, 2, 5, 10].find(factor => factor * power >= rough);
   const found = [];
-  for (let k = Math.ceil(low / step); k * step <= high * (1 + 1e-9); ++k) found.push(k * step);
+  const from = Math.ceil(low / step);
+  for (let k = 0; k <= 2 * count && (from + k) * step <= high * (1 + 1e-9); ++k) found.push((from + k) * step);
   return found;
 }
 
@@ -73,6 +74,7 @@ function logarithmic(low, high) {
       const value = power + Math.log10(factor);
       if (value >= low && value <= high) found.push(value);
     }
+  if (found.length < 2) return ticks(10 ** low, 10 ** high, 4).map(Math.log10);
   return found.filter((_, number) => number % Math.ceil(found.length / 6) === 0);
 }
 

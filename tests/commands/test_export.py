@@ -57,6 +57,9 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "cameras")
     several = nerf("export", f"ckpt={last}", "what=images", "what.max_views=many", where)
     said(several, "what.max_views=many is not valid")
+    whole = nerf("export", f"ckpt={last}", "what=cameras", "crop=[[-1,-1,-1],[1,1,1]]", where)
+    said(whole, "crop: this exporter writes the whole scene")
+    said(nerf("export", f"ckpt={last}", "what=cameras", "crop=3", where), "crop=3: give the lower and the upper corner")
     assert not list(tmp_path.iterdir())
 
 

@@ -50,10 +50,12 @@ class TrainJob(Run):
 def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
     former = ranks.from_first(lambda: former_config(asked, job_folder()))
-    if job_folder() is not None and asked.final.page == AUTO:
+    overrides = typed_overrides()
+    if job_folder() is not None and asked.final.get("page") == AUTO:
         asked = copy.deepcopy(asked)
         asked.final.page = False  # the runs of a sweep are compared, not handed over
-    job = assemble_job(asked, HydraConfig.get().runtime.choices, typed_overrides(), former, scene)
+        overrides.append("final.page=false")
+    job = assemble_job(asked, HydraConfig.get().runtime.choices, overrides, former, scene)
     if job_folder() is not None:
         job.signals.stop_file = stop_file(Path(HydraConfig.get().sweep.dir))
     return job

@@ -3,6 +3,7 @@
 import logging
 from dataclasses import dataclass
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.compute.machine import free_memory
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
@@ -44,13 +45,17 @@ def needs(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule)
     largest = int((pixels.width * pixels.height).max())
     picture = PIXEL_BYTES * largest + CHUNK_BYTES * min(largest, CHUNK_PIXELS)
     weights = sum(tensor.nbytes for tensor in [*model.parameters(), *model.buffers()])
+    # Pixels that stay where they are, in memory or in a mapped file, are not requested again.
+    moved = num_bytes(pixels) if data.fits(settings.device) else 0
+    on_cpu = settings.device_type == "cpu"
+    compiled = COMPILED_PER_MATRIX * len(matrices) if on_cpu and settings.precision == "bf16-mixed" else 0
     tile = "data.batch_rays" if settings.tile_points is None else "trainer.tile_points"
     return [
-        Need("the photographs", num_bytes(pixels), "raise scene.downscale"),
+        Need("the photographs", moved, "lower data.device_budget, or raise scene.downscale"),
         Need("the largest picture", picture, "raise scene.downscale"),
         Need(
             "weights, gradients and the optimizer's state",
-            4 * weights + COMPILED_PER_MATRIX * len(matrices),
+            4 * weights + compiled,
             "lower encoder.log2_table_size or field.width, or choose a smaller model",
         ),
         Need("the rays of a step", batch * RAY_BYTES, "lower data.batch_rays"),
@@ -61,7 +66,9 @@ def needs(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule)
 def announce_memory(settings: TrainerSettings, train_step: TrainStep, data: RayDataModule) -> None:
     """Warn where memory may be short; the parts are details (-v)."""
     free, parts = free_memory(settings.device), needs(settings, train_step, data)
-    most = sum(need.num_bytes for need in parts)
+    # The processes of a CPU share its memory; most of them run on one machine.
+    processes = ranks.world_size() if settings.device_type == "cpu" else 1
+    most = processes * sum(need.num_bytes for need in parts)
     for need in parts:
         log.debug("memory: at most %.3f GB for %s", need.num_bytes / GIGABYTE, need.what)
     if TAKEN * most > free:

@@ -76,6 +76,7 @@ class SplatsExport(SplatFitting):
         known: dict[str, Any] = {"splats": len(shown), "bytes": path.stat().st_size}
         known |= {"seconds": round(time.monotonic() - began, 1), "fitting_seconds": self.seconds}
         known |= {"fitted_to": found.truth, "views": comparison.views}
+        known |= {} if run.crop is None else {"measured": "the whole scene, without the crop box"}
         known |= {"splats_metrics": comparison.splats} | (
             {"field_metrics": comparison.field} if comparison.field else {}
         )

@@ -67,7 +67,8 @@ class PageExport(SplatFitting):
             splats, facts = QuantizedSplats.of(found.gaussians), []
             if self.max_views:
                 chosen = record.background, self.max_views, tile_points
-                facts = [("PSNR", compared(found, splats.gaussians(), model, *chosen, report).psnr())]
+                psnr = compared(found, splats.gaussians(), model, *chosen, report).psnr()
+                facts = [("PSNR", f"{psnr}{'' if run.crop is None else ' (of the whole scene)'}")]
             splats = splats if run.crop is None else QuantizedSplats.of(cropped(found.gaussians, run))
         known = [*facts, ("splats", f"{splats.splats:,}, fitted to {found.truth} for {self.seconds:g} s")]
         chosen_texts = marks, self.title, self.first_view

@@ -78,7 +78,7 @@ def write_page(
         first = record.view_names.index(first_view)
     else:
         first = average_view(record, views)
-    middle, radius = _middle(shown, record)
+    middle, radius = _middle(shown, record, run.crop is not None)
     up = functional.normalize(record.cameras.c2w[:, :, 1].mean(dim=0), dim=0)
     about = splats.described() | {
         "bytes": len(packed),
@@ -149,12 +149,12 @@ def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -
     return None if gap < WIDEST_GAP else math.radians(min(MOST_SWAY, (360.0 - gap) / 4))
 
 
-def _middle(splats: Gaussians, record: SceneRecord) -> tuple[list[float], float]:
-    """Return the center of the orbit, and the distance of the content from it, in the world."""
-    if record.space == "ndc":
+def _middle(splats: Gaussians, record: SceneRecord, is_part: bool) -> tuple[list[float], float]:
+    """Return the center of the orbit, and the distance of the content from it, in the world; `is_part` of the scene."""
+    if record.space == "ndc" and not is_part:
         return [0.0, 0.0, -2.0], 1.0
     lower, upper = record.aabb
-    if record.space == "bounded":
+    if record.space == "bounded" or is_part:
         lower, upper = (torch.from_numpy(np.quantile(splats.means.numpy(), at, axis=0)) for at in (INSIDE, 1 - INSIDE))
     return ((lower + upper) / 2).tolist(), float((upper - lower).norm() / 2)
 

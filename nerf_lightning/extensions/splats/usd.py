@@ -53,6 +53,7 @@ CAMERA = """        def Camera "View_{number:04d}" (
             float focalLength = {focal:.7g}
             float horizontalAperture = {width:.7g}
             float verticalAperture = {height:.7g}
+            float2 clippingRange = (0.001, 1000000)
             float horizontalApertureOffset = {right:.7g}
             float verticalApertureOffset = {up:.7g}
             matrix4d xformOp:transform = ({rows})
@@ -97,8 +98,9 @@ def _camera(cameras: Cameras, view: int) -> str:
         focal=pixel * fx,
         width=SENSOR,
         height=pixel * height,
-        right=pixel * (cx - width / 2),
-        up=pixel * (height / 2 - cy),
+        # The window moves to where the principal point is not.
+        right=pixel * (width / 2 - cx),
+        up=pixel * (cy - height / 2),
         rows=", ".join(_tuple(row) for row in matrix.T.tolist()),  # USD's vectors are rows
     )
 

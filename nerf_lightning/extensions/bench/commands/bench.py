@@ -33,9 +33,9 @@ from nerf_lightning.extensions.bench.stages import (
     multiplication,
     stage_seconds,
 )
-from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.json_files import print_json, write_json
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.console import StdoutConsole, say_json, say_written, stderr_console
+from nerf_lightning.messages.console import StdoutConsole, say_written, stderr_console
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.plan_run import read_scene
 
@@ -69,7 +69,7 @@ def run(config: DictConfig) -> float:
     folder = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
     write_json(folder / "bench.json", result)
     if config.json:
-        say_json(result | {"written": [folder / "bench.json"]})
+        print_json(result | {"written": [folder / "bench.json"]})
     else:
         _print_table(result)
         say_written(folder / "bench.json")

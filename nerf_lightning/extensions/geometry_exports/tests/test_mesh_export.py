@@ -15,11 +15,13 @@ from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.export.base import RunContext
 from nerf_lightning.extensions.geometry_exports.density_mesh import without_floaters
 from nerf_lightning.extensions.geometry_exports.fused_mesh import depth_rays
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.world_frame import similarity, unit_of, upright_rotation
 
 RADIUS = 0.8
@@ -34,10 +36,22 @@ def record(**changes):
     return replace(scene_record(ball_scene(num_views=8, size=24)), **changes)
 
 
-def exported(folder, model, scene, **settings):
-    (path,) = MeshExport(**{"resolution": 48, "seen_only": False} | settings).export(model, scene, folder, TILE)
+def exported(folder, model, scene, crop=None, **settings):
+    what, run = MeshExport(**{"resolution": 48, "seen_only": False} | settings), RunContext(crop=crop)
+    (path,) = what.export(model, scene, folder, TILE, run)
     loaded = trimesh.load(path, process=False)
     return next(iter(loaded.geometry.values())) if isinstance(loaded, trimesh.Scene) else loaded
+
+
+def test_only_the_surface_in_a_crop_box_is_written(tmp_path):
+    upper = CropBox.from_user((-1.0, -1.0, 0.0), (1.0, 1.0, 1.0), torch.eye(4))
+    mesh = exported(tmp_path, solid(ball()), record(), upper)
+    assert 0.0 < mesh.vertices[:, 2].min() < 0.1
+    assert mesh.area == pytest.approx(2 * np.pi * RADIUS**2, rel=0.1)
+    with pytest.raises(InputError, match="there is no surface in this box"):
+        exported(tmp_path, solid(ball()), record(), CropBox.from_user((0.9, 0.9, 0.9), (1.0, 1.0, 1.0), torch.eye(4)))
+    with pytest.raises(InputError, match="asks for a closed mesh, which a crop box opens"):
+        exported(tmp_path, solid(ball()), record(), upper, format="stl")
 
 
 def colors_of(mesh):

@@ -13,6 +13,7 @@ from support.posed_captures import Known, read, wall, write_llff
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.export.base import RunContext
 from nerf_lightning.export.visibility import num_agreeing, see
 from nerf_lightning.extensions.geometry_exports.points import (
     BYTES_PER_PIXEL,
@@ -22,6 +23,7 @@ from nerf_lightning.extensions.geometry_exports.points import (
     scale_and_offset,
 )
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.world_frame import similarity, upright_rotation
 
 TILE = 1 << 15
@@ -31,9 +33,19 @@ def record(**changes):
     return replace(scene_record(ball_scene(num_views=12, size=24)), **changes)
 
 
-def exported(folder, model, scene, **settings):
-    (path,) = PointsExport(**settings).export(model, scene, folder, TILE)
+def exported(folder, model, scene, crop=None, **settings):
+    (path,) = PointsExport(**settings).export(model, scene, folder, TILE, RunContext(crop=crop))
     return trimesh.load(path), path
+
+
+def test_only_the_points_in_a_crop_box_are_written(tmp_path):
+    to_user = similarity(torch.eye(3), torch.tensor([5.0, 6.0, 7.0]), 100.0)
+    upper = CropBox.from_user((-1e3, -1e3, 7.0), (1e3, 1e3, 1e3), to_user)
+    cloud, _ = exported(tmp_path, solid(ball()), record(to_user=to_user), upper)
+    assert len(cloud.vertices) > 100
+    assert cloud.vertices[:, 2].min() > 7.0
+    with pytest.raises(InputError, match="there are no points in this box"):
+        exported(tmp_path, solid(ball()), record(), CropBox.from_user((8.0, 8.0, 8.0), (9.0, 9.0, 9.0), torch.eye(4)))
 
 
 def normals_of(path):

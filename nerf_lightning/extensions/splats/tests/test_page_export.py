@@ -12,6 +12,7 @@ from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of,
 
 from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.files.html import is_scene_page
+from nerf_lightning.nerf.geometry.clipping import CropBox
 
 NAME = '</script><script>alert(1)</script><img src=x onerror="alert(2)">'
 
@@ -87,6 +88,17 @@ def test_texts_of_a_stranger_stay_texts(page, tmp_path):
     assert theirs.texts.count(NAME) >= 4
     assert not {"onerror", "onload"} & {name for _, attrs in theirs.found for name in attrs}
     assert not {"\x1b", "\u202e"} & set(planted.read_text())
+
+
+def test_one_turns_around_the_middle_of_a_crop_box(tmp_path):
+    box = CropBox.from_user((0.2, -1.0, -1.0), (1.0, 1.0, 1.0), torch.eye(4))
+    with torch.no_grad():
+        what, run = PageExport(300, 0.0, photographs=3), replace(run_of(all_around()), crop=box)
+        (target,) = what.export(shiny_model(), record_of(all_around()), tmp_path, 65_536, run)
+    about, splats = read_page(target)
+    assert splats.means[:, 0].min() > 0.2
+    assert about["middle"][0] > 0.25
+    assert "(of the whole scene)" in target.read_text()
 
 
 def test_without_photographs_the_cameras_are_still_there(tmp_path):

@@ -152,6 +152,20 @@ def test_a_usda_is_a_stage_with_splats_and_cameras(tmp_path):
     assert shown == pytest.approx(float(scene.cameras.focal[1, 0]) / 16, rel=1e-6)
 
 
+def test_a_principal_point_off_the_center_is_where_it_was_in_usd(tmp_path):
+    Usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (make setup)")
+    from pxr import UsdGeom
+
+    cameras = ball_scene(num_views=1, size=16).cameras
+    cameras = replace(cameras, center=torch.tensor([[4.0, 10.0]]))  # right and down from the upper left corner
+    save_splats(tmp_path / "splats.usda", some(), cameras)
+    stage = Usd.Stage.Open(str(tmp_path / "splats.usda"))
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath("/Scene/Cameras/View_0000")).GetCamera().frustum
+    (left, bottom), (right, top) = frustum.window.min, frustum.window.max
+    assert -left / (right - left) == pytest.approx(4 / 16, abs=1e-6)
+    assert top / (top - bottom) == pytest.approx(10 / 16, abs=1e-6)
+
+
 def test_spz_places_fit_far_from_the_origin(tmp_path):
     gsply = pytest.importorskip("gsply", reason="gsply is not installed (the extra splats)")
     splats = some()

@@ -13,6 +13,7 @@ from support.command_fixtures import *  # noqa: F403
 from support.configs import composed
 from support.known_fields import ball, photographed_ball, solid
 from support.planted import in_config, write_checkpoint
+from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import read_checkpoint, scene_record
@@ -26,6 +27,7 @@ from nerf_lightning.extensions.splats.fitted import training_views
 from nerf_lightning.extensions.splats.views import photographed, without_lens
 from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 from nerf_lightning.nerf.geometry.world_frame import similarity, upright_rotation
 from nerf_lightning.nerf.rendering.linear_light import scale_light, to_linear
@@ -33,9 +35,9 @@ from nerf_lightning.nerf.rendering.linear_light import scale_light, to_linear
 TILE = 1 << 15
 
 
-def exported(folder, model, scene, photographs=True, **settings):
+def exported(folder, model, scene, photographs=True, crop=None, **settings):
     export = SplatsExport(**({"num_splats": 600, "seconds": 0.0, "sh_degree": 1} | settings))
-    run = RunContext(photographs=scene if photographs else None)
+    run = RunContext(photographs=scene if photographs else None, crop=crop)
     with torch.no_grad():
         written = export.export(model, scene_record(scene), folder, TILE, run)
     return json.loads((folder / "splats.json").read_text()), written
@@ -60,6 +62,19 @@ def test_fitting_brings_the_splats_nearer_to_the_photographs(tmp_path):
     pixels = apart / float(scene.cameras.focal[0, 0])
     assert (thinnest > 0.9 * LEAST_VARIANCE**0.5 * pixels).all()  # means move a little after the last split
     assert (thinnest < 2.0 * pixels).mean() > 0.5
+
+
+def test_only_the_splats_in_a_crop_box_are_written_and_all_are_compared(tmp_path):
+    scene, model = photographed_ball(24)
+    upper = CropBox.from_user((-1.0, -1.0, 0.0), (1.0, 1.0, 1.0), scene.to_user)
+    whole, _ = exported(tmp_path / "whole", model, scene, frame="capture")
+    part, written = exported(tmp_path / "part", model, scene, crop=upper, frame="capture")
+    assert 0 < part["splats"] < 0.7 * whole["splats"]
+    assert part["splats_metrics"] == whole["splats_metrics"]
+    assert "without the crop box" in part["measured"]
+    assert rows_of(written[0])[:, 2].min() > 0
+    outside = CropBox.from_user((8.0, 8.0, 8.0), (9.0, 9.0, 9.0), scene.to_user)
+    refused(exported, tmp_path / "none", model, scene, True, outside, parts=("crop: there are no splats in this box",))
 
 
 def test_without_photographs_the_field_is_what_they_are_fitted_to(tmp_path):
