@@ -1,10 +1,12 @@
 """What README and docs say is true: examples run, commands compose, settings and files that they name are there."""
 
+import itertools
 import json
 import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -263,6 +265,7 @@ SMALLER = (
     (r"data\.crop_steps=\d+", "data.crop_steps=1"),
     (r"width=64\)", "width=8)"),
     (r"num_samples=\d+", "num_samples=8"),
+    (r"\bsteps = \d+", "steps = 2"),
 )
 AT_THE_END = {
     "first_scene": "assert picture.rgb.shape == (16, 16, 3) and len(plt.get_fignums()) == 3, picture.rgb.shape",
@@ -272,7 +275,18 @@ AT_THE_END = {
         "try:\n    nl.load('own.ckpt')\n"
         "except nl.InputError as error:\n    print('refused:', error)"
     ),
+    "course_1_image": "assert encoded.shape == (256, 3) and len(plt.get_fignums()) == 5, encoded.shape",
+    "course_2_rays": "assert colors.shape == (96 * 96, 3) and len(plt.get_fignums()) == 7, colors.shape",
+    "course_3_scene": "assert picture.rgb.shape == (16, 16, 3) and len(curve) == 2 and len(plt.get_fignums()) == 4",
 }
+SAID = {
+    "first_scene": {"dB on test views": 1},
+    "own_field_and_loss": {"dB on test views": 1, "refused: ": 1},
+    "course_1_image": {"correct: ": 2},
+    "course_2_rays": {"correct: ": 4},
+    "course_3_scene": {"correct: ": 3, "dB on test views": 2},
+}
+"""What each notebook prints, and how often."""
 
 
 def test_every_notebook_is_tested():
@@ -281,12 +295,43 @@ def test_every_notebook_is_tested():
 
 @pytest.mark.parametrize("name", AT_THE_END)
 def test_a_notebook_runs_from_top_to_bottom(name, tmp_path):
+    output = what_prints([*code_cells(name), AT_THE_END[name]], tmp_path)
+    assert {said: output.count(said) for said in SAID[name]} == SAID[name]
+
+
+@pytest.mark.parametrize("name", [name for name in SAID if "correct: " in SAID[name]])
+def test_a_wrong_solution_of_an_exercise_fails_with_the_equation_to_read(name, tmp_path):
+    wrong = re.findall(r"^wrong: .*", what_prints(with_wrong_solutions(code_cells(name)), tmp_path), flags=re.MULTILINE)
+    assert len(wrong) == 2 * SAID[name]["correct: "]
+    assert [message for message in wrong if "Look at equation" not in message] == []
+
+
+def code_cells(name):
     cells = json.loads((REPOSITORY / "docs" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
-    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+
+
+def what_prints(cells, folder):
+    """What code cells print, with smaller sizes."""
+    code = "\n\n".join(cells)
     for given, instead in SMALLER:
         code = re.sub(given, instead, code)
-    process = start_code(f"{code}\n\n{AT_THE_END[name]}\n", cwd=tmp_path)
+    process = start_code(f"{code}\n", cwd=folder)
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors[-3000:]
-    assert "dB on test views" in output
-    assert name == "first_scene" or "refused: " in output
+    return output
+
+
+def with_wrong_solutions(cells):
+    """The cells before the last check, each run on a function without a body and on one that is slightly off, too."""
+    last = max(number for number, cell in enumerate(cells) if cell.startswith("# Exercise"))
+    for cell, check in itertools.pairwise(cells[: last + 2]):
+        yield cell
+        if cell.startswith("# Exercise"):
+            (function,) = re.findall(r"^def (\w+)\(", cell, flags=re.MULTILINE)
+            unsolved = re.sub(r" +# solution\n.*?# end", "", cell, flags=re.DOTALL)
+            slightly_off = f"right = {function}\n{function} = lambda *given, **named: right(*given, **named) + 0.01"
+            said = "print('wrong:', str(error).splitlines()[0])\nelse:\n    raise SystemExit('accepted')"
+            for wrong in (unsolved, slightly_off):
+                yield f"{wrong}\ntry:\n{textwrap.indent(check, '    ')}\nexcept AssertionError as error:\n    {said}"
+                yield cell
