@@ -156,13 +156,11 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first, require_settings
         from nerf_lightning.cli.loading import compose_once
-        from nerf_lightning.config.help.catalogue import command_named, known_names
         from nerf_lightning.config.hydra_versions import hydra_main
         from nerf_lightning.config.search_path import search_extensions
 
-        asked = command_named(command)
-        if JSON in arguments and (asked is None or "json" not in known_names(asked)):
-            raise InputError(f"nerf {command} prints no table: {JSON} is for nerf doctor, table, selftest and bench.")
+        if JSON in arguments:
+            _require_table(command)
         arguments = options_first([_setting_of(word) for word in arguments], command)
         require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)
@@ -177,6 +175,14 @@ def _run(command: str, arguments: list[str]) -> None:
             watched(run)
         else:
             run()
+
+
+def _require_table(command: str) -> None:
+    from nerf_lightning.config.help.catalogue import command_named, known_names
+
+    asked = command_named(command)
+    if asked is None or "json" not in known_names(asked):
+        raise InputError(f"nerf {command} prints no table: {JSON} is for nerf doctor, table, selftest and bench.")
 
 
 def _setting_of(word: str) -> str:
