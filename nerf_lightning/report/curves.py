@@ -17,7 +17,7 @@ Curve = tuple[Sequence[int], Sequence[float]]  # Steps and values
 MOST_CURVES = 12
 """In one chart; more are not told apart, and a stranger's file may have thousands."""
 DIGITS = 5
-MOST_STEPS = 10**12
+LARGEST_STEP = 10**12
 """An untrusted file may number steps beyond what a script can count."""
 
 
@@ -89,7 +89,7 @@ def _finite(curve: Curve, chart: Chart) -> Curve:
     kept = [
         (step, float(f"{value:.{DIGITS}g}"))
         for step, value in zip(*curve, strict=True)
-        if 0 <= step <= MOST_STEPS and math.isfinite(value) and (value > 0 or not chart.is_logarithmic)
+        if 0 <= step <= LARGEST_STEP and math.isfinite(value) and (value > 0 or not chart.is_logarithmic)
     ]
     return [step for step, _ in kept], [value for _, value in kept]
 

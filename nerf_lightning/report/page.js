@@ -22,20 +22,18 @@ for (const figure of document.querySelectorAll(".wipe")) {
 }
 
 // Color and depth of the same film play in step.
-const films = [...document.querySelectorAll(".films video")].slice(0, 2);
-for (const film of films) {
-  const others = films.filter(other => other !== film);
-  const follow = () => others.forEach(other => {
-    if (Math.abs(other.duration - film.duration) > 0.1) return;
-    if (Math.abs(other.currentTime - film.currentTime) > 0.08) other.currentTime = film.currentTime;
-  });
-  film.addEventListener("play", () => others.forEach(other => other.paused && other.play()));
-  film.addEventListener("pause", () => others.forEach(other => other.pause()));
-  film.addEventListener("seeking", follow);
+const [color, depth] = document.querySelectorAll(".paired video");
+if (depth) {
+  const align = (film, other) => {
+    if (Math.abs(other.currentTime - film.currentTime) > 0.1) other.currentTime = film.currentTime;
+  };
+  for (const [film, other] of [[color, depth], [depth, color]]) {
+    film.addEventListener("play", () => other.paused && other.play());
+    film.addEventListener("pause", () => other.pause());
+    film.addEventListener("seeking", () => align(film, other));
+  }
+  color.addEventListener("timeupdate", () => align(color, depth));
 }
-films[0]?.addEventListener("timeupdate", () => {
-  if (films[1] && Math.abs(films[1].currentTime - films[0].currentTime) > 0.25) films[1].currentTime = films[0].currentTime;
-});
 
 // Charts: each curve, smoothed where it is noisy, and the values at the pointer.
 const COLORS = ["#2f6db3", "#e07b39", "#3c9d6b", "#8b5fbf", "#c8372d", "#6a7280"];
@@ -130,7 +128,6 @@ function draw(figure, chart) {
       span.style.color = color;
       return span;
     }));
-    label.classList.add("legend");
   };
   const legend = () => {
     cursor.setAttribute("visibility", "hidden");
