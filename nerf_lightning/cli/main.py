@@ -14,11 +14,15 @@ from textwrap import fill
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from nerf_lightning.cli.loading import announce_start, quick_imports
-from nerf_lightning.cli.prepare import PATHS_ALONE, prepared
-from nerf_lightning.cli.process import ends_quietly, require_no_settings_here, was_interrupted
-from nerf_lightning.cli.quoting import quoted_paths
-from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
+from nerf_lightning.cli.arguments import quoted_paths
+from nerf_lightning.cli.prepare import PATHS_ALONE, is_sweep, prepared, sweep_arguments
+from nerf_lightning.cli.process import (
+    announce_start,
+    ends_quietly,
+    quick_imports,
+    require_no_settings_here,
+    was_interrupted,
+)
 from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
@@ -155,9 +159,8 @@ def _run(command: str, arguments: list[str]) -> None:
 
     with explained(command):
         from nerf_lightning.cli.arguments import options_first, require_settings
-        from nerf_lightning.cli.loading import compose_once
-        from nerf_lightning.config.hydra_versions import hydra_main
-        from nerf_lightning.config.search_path import search_extensions
+        from nerf_lightning.cli.process import compose_once
+        from nerf_lightning.config.hydra_versions import hydra_main, search_extensions
 
         if JSON in arguments:
             _require_table(command)

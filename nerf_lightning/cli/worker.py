@@ -8,9 +8,8 @@ import json
 import sys
 from pathlib import Path
 
-from nerf_lightning.cli.loading import quick_imports
 from nerf_lightning.cli.main import command_module, explained
-from nerf_lightning.cli.process import quick_end
+from nerf_lightning.cli.process import quick_end, quick_imports
 from nerf_lightning.files.budgets import Budgets, set_limits
 
 

@@ -5,8 +5,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import as_known, open_checkpoint
-from nerf_lightning.evaluation.metric_lines import metric_lines
-from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.evaluation.protocol import measured_of, metric_lines
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes

@@ -10,10 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.config.instantiate import require_fitting_values, required_path
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.data.sfm.find_poses import from_photographs, from_video, require_new_capture
+from nerf_lightning.data.sfm.find_poses import from_photographs, from_video, require_new_capture, summary_lines
 from nerf_lightning.data.sfm.reconstruction import require_pycolmap
 from nerf_lightning.data.sfm.settings import SfmSettings
-from nerf_lightning.data.sfm.summary import summary_lines
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_positive

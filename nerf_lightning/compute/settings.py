@@ -10,10 +10,27 @@ from nerf_lightning.compute import ranks, xla_device
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.compute.devices import Accelerator, choose_device, prepare_machine, working_device
 from nerf_lightning.compute.precision import Precision, choose_precision, suited
-from nerf_lightning.compute.tile_size import bounded_tile_points, default_tile_points
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.models.base import Model
+
+CPU_TILE_POINTS = 8_192
+GPU_TILE_POINTS = 1 << 20
+MOST_CPU_TILE_POINTS = 1 << 18
+MOST_GPU_TILE_POINTS = 1 << 22
+LEAST_TILE_POINTS = 1 << 10
+
+
+def default_tile_points(device_type: str) -> int:
+    """Return the number of points of a tile that was not measured."""
+    return CPU_TILE_POINTS if device_type == "cpu" else GPU_TILE_POINTS
+
+
+def bounded_tile_points(measured: int, device_type: str) -> int:
+    """Return a measured number within bounds: from an untrusted file, it may be tiny (slow) or huge (out of memory)."""
+    most = MOST_CPU_TILE_POINTS if device_type == "cpu" else MOST_GPU_TILE_POINTS
+    return min(max(measured, LEAST_TILE_POINTS), most)
+
 
 Launcher = Literal["nerf", "torchrun", "slurm"]
 PRODUCTS: dict[str, MatmulPrecision] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}

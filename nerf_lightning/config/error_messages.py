@@ -14,8 +14,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.config.help.catalogue import Command, command_named, known_names
 from nerf_lightning.config.help.suggestions import did_you_mean, near
-from nerf_lightning.config.lightning_arguments import OWNED
 from nerf_lightning.config.overrides import PLAIN, to_type
+from nerf_lightning.config.setting_rules import LIGHTNING_ARGUMENTS
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -141,7 +141,7 @@ def _not_given(error: MissingMandatoryValue, command: str) -> str:
     last = max(Path(root).glob("**/checkpoints/last.ckpt"), key=lambda file: file.lstat().st_mtime, default=None)
     if last is None:
         return f"nerf {command} needs a run, and {root}/ holds none: train one, or name its folder with {key}=DIR."
-    newest = shlex.quote(str(last.parent.parent))  # cli/quoting.py does the rest
+    newest = shlex.quote(str(last.parent.parent))  # cli/arguments.py does the rest
     return f"nerf {command} needs a run. For the newest below {root}/, type: nerf {command} {key}={newest}"
 
 
@@ -182,8 +182,8 @@ def _no_setting(name: str, value: str | None, asked: Command) -> str:
         return f"{name} is a setting of {having}, which is not chosen.{instead} nerf help {name} explains it."
     told = f"nerf {asked.name} has no setting {name}."
     section, _, argument = name.partition(".")
-    if section == "trainer" and argument in OWNED:
-        return f"{told} What Lightning's Trainer calls {argument} is {OWNED[argument]} here."
+    if section == "trainer" and argument in LIGHTNING_ARGUMENTS:
+        return f"{told} What Lightning's Trainer calls {argument} is {LIGHTNING_ARGUMENTS[argument]} here."
     training = command_named("train")
     if training is not None and name in known_names(training):
         return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."

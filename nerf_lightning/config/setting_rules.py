@@ -149,3 +149,39 @@ def names_a_class(key: str) -> bool:
 def fingerprint(identity: dict[str, Any]) -> str:
     """Return a short name of an identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+LIGHTNING_ARGUMENTS = {
+    "accelerator": "trainer.accelerator",
+    "accumulate_grad_batches": "data.batch_rays (where memory is short: trainer.tile_points)",
+    "barebones": "nerf bench",
+    "callbacks": "callbacks (+callbacks.NAME._target_=my_package.MyCallback)",
+    "check_val_every_n_epoch": "trainer.val_every_steps",
+    "default_root_dir": "paths.output_dir",
+    "deterministic": "trainer.deterministic",
+    "devices": "trainer.devices",
+    "enable_checkpointing": "callbacks.checkpoints",
+    "enable_progress_bar": "callbacks.progress_bar (~callbacks.progress_bar)",
+    "gradient_clip_algorithm": "trainer.clip_norm",
+    "gradient_clip_val": "trainer.clip_norm",
+    "limit_predict_batches": "path.num_frames",
+    "limit_test_batches": "evaluation.max_views",
+    "limit_train_batches": "trainer.max_steps",
+    "logger": "logger",
+    "max_epochs": "trainer.max_epochs",
+    "max_steps": "trainer.max_steps",
+    "max_time": "budget.seconds",
+    "min_epochs": "trainer.max_epochs",
+    "min_steps": "trainer.max_steps",
+    "model_registry": "callbacks.checkpoints",
+    "num_nodes": "trainer.launched_by",
+    "overfit_batches": "scene.frames, which keeps some views",
+    "plugins": "trainer.launched_by",
+    "precision": "trainer.precision",
+    "reload_dataloaders_every_n_epochs": "data",
+    "strategy": "trainer.devices",
+    "sync_batchnorm": "trainer.devices=1 (field.batch_norm trains in one process)",
+    "use_distributed_sampler": "trainer.devices",
+    "val_check_interval": "trainer.val_every_steps",
+}
+"""Arguments of Lightning's Trainer that settings of ours determine, and which ones."""

@@ -13,10 +13,9 @@ from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import image_plane
-from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
 from nerf_lightning.nerf.geometry.lenses import stretches, unproject
 from nerf_lightning.nerf.geometry.poses import is_rigid
-from nerf_lightning.nerf.geometry.world_frame import focus_point, gaps_around
+from nerf_lightning.nerf.geometry.world_frame import directions_seen, focus_point, gaps_around, middle_of
 from nerf_lightning.nerf.types.scene import Scene
 
 # Fields of view (degrees across the longer side) that photographers use.

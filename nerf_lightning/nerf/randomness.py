@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Word = TypeVar("Word", int, Tensor)

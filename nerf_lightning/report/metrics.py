@@ -9,8 +9,7 @@ from nerf_lightning.files.json_files import mapping, number
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.embedding import embedded_file
-from nerf_lightning.report.page import Pairs, ViewOnPage
+from nerf_lightning.report.page import Pairs, ViewOnPage, embedded_file
 
 FORMATS = {
     "psnr": "{:.2f} dB",

@@ -15,9 +15,8 @@ from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings, read_curves
-from nerf_lightning.report.embedding import embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page
-from nerf_lightning.report.page import Report
+from nerf_lightning.report.page import Report, embedded, embedded_file, embedded_video
 from nerf_lightning.runs.results import scene_name
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.runs.summary import read_run as read_summary

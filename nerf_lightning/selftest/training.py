@@ -10,14 +10,55 @@ from nerf_lightning.config.compose import compose_config
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
+from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
 from nerf_lightning.selftest.check import Check, gradient_bound, norm_apart
-from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.validation import RayErrors
+
+RADIUS = 0.8
+NUM_VIEWS, SIZE = 10, 20
+FOCAL = 1.6 * SIZE
+TRAIN, HELD_OUT = tuple(range(8)), (8, 9)
+
+
+def ball_scene() -> Scene:
+    """Return ten small views from a circle, with alpha; eight are for training, two are held out."""
+    angle = 2.4 * torch.arange(NUM_VIEWS)  # the golden angle: all parts of the views are spread over the circle
+    eyes = 4.0 * torch.stack([angle.cos(), angle.sin(), 0.4 + 0.0 * angle], dim=-1)
+    cameras = pinhole_cameras(look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.0, 0.0, 1.0])), FOCAL, SIZE, SIZE)
+    near, far = torch.full((NUM_VIEWS,), 2.0), torch.full((NUM_VIEWS,), 6.5)
+    pictures = []
+    for view in range(NUM_VIEWS):
+        rays = rays_through_pixels(cameras, all_pixels(cameras, view), near, far)
+        along = -(rays.origins * rays.directions).sum(-1)
+        closest = rays.origins + along[..., None] * rays.directions
+        half = (RADIUS**2 - closest.square().sum(-1)).clamp(min=0).sqrt()
+        normal = (closest - half[..., None] * rays.directions) / RADIUS
+        hit = (half > 0).float()[..., None]
+        pictures.append(torch.cat([(0.5 + 0.5 * normal).clamp(0, 1) * hit, hit], dim=-1))
+    rgba = (torch.stack(pictures) * 255).round().to(torch.uint8).reshape(-1, 4)
+    sizes = torch.full((NUM_VIEWS,), SIZE)
+    return Scene(
+        name="ball",
+        cameras=cameras,
+        pixels=PixelStore(rgba, torch.arange(NUM_VIEWS) * SIZE**2, sizes, sizes, has_transparency=True),
+        near=near,
+        far=far,
+        aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]),
+        splits={"train": TRAIN, "val": HELD_OUT, "test": HELD_OUT},
+        view_names=tuple(f"ball_{view}" for view in range(NUM_VIEWS)),
+        background="random",
+        to_user=torch.eye(4, dtype=torch.float64),
+        protocol={},
+        truth=None,
+    )
+
 
 SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
 ENCODER = (

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
+from nerf_lightning.nerf.geometry.world_frame import directions_seen, middle_of
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.visualization.figures import new_figure, picture_of
 

@@ -4,9 +4,8 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from support.running import refused
 
-from nerf_lightning.cli.arguments import require_settings
-from nerf_lightning.cli.quoting import quoted_paths, unquoted
-from nerf_lightning.cli.sweep_arguments import sweep_arguments
+from nerf_lightning.cli.arguments import quoted_paths, require_settings, unquoted
+from nerf_lightning.cli.prepare import sweep_arguments
 
 PATHS = ["a=b,c", "my fox (1)", "[2024] fox", "新加卷/数据 1", "fox é", "2024", "1e3", "it's", "C:\\my fox", "~/fox"]
 KEYS = ["scene.root", "images", "+scene.images", "paths.output_dir", "x.depth_file", "checkpoint", "ckpt", "run"]

@@ -8,7 +8,7 @@ import pytest
 from support.cold_import import cold_import
 
 from nerf_lightning.cli import prepare
-from nerf_lightning.cli.loading import announce_start, quick_imports
+from nerf_lightning.cli.process import announce_start, quick_imports
 from nerf_lightning.config.scene_overrides import UnknownScene
 
 

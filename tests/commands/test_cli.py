@@ -36,7 +36,7 @@ def test_the_settings_that_readers_share_are_no_scene_and_no_command(nerf):
 
 
 def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
-    """cli/loading.py counts on it."""
+    """cli/process.py counts on it."""
     configs = [OmegaConf.load(file) for file in yaml_files()]
     assert len(configs) > 50
     assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]

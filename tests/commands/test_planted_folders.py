@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from support.configs import composed
 from support.running import FAST, said
 
-from nerf_lightning.cli.sweep_arguments import sweep_arguments
+from nerf_lightning.cli.prepare import sweep_arguments
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.errors import InputError

@@ -6,7 +6,7 @@ import pytest
 from support.configs import composed
 from support.running import start_code
 
-from nerf_lightning.cli.sweep_arguments import sweep_arguments
+from nerf_lightning.cli.prepare import sweep_arguments
 from nerf_lightning.config import hydra_versions
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import SweepRecord

@@ -4,7 +4,8 @@ import pytest
 import torch
 from support.scenes import tiny_model
 
-from nerf_lightning.compute import precision, tile_size
+from nerf_lightning.compute import precision
+from nerf_lightning.compute.settings import CPU_TILE_POINTS, MOST_CPU_TILE_POINTS
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -69,11 +70,11 @@ def test_no_steps_at_all_and_norms_that_are_none_are_refused():
 
 
 def test_tiles_can_be_chosen_and_switched_off():
-    assert TrainerSettings(accelerator="cpu").tile_points == tile_size.CPU_TILE_POINTS
+    assert TrainerSettings(accelerator="cpu").tile_points == CPU_TILE_POINTS
     assert TrainerSettings(tile_points=99).tile_points == 99
     whole = TrainerSettings(accelerator="cpu", tile_points=None)
     assert whole.tile_points is None
-    assert whole.inference_tile_points == tile_size.CPU_TILE_POINTS
+    assert whole.inference_tile_points == CPU_TILE_POINTS
 
 
 def test_what_a_run_measured_is_kept_as_far_as_somebody_could_have_measured_it_but_does_not_overrule():
@@ -81,7 +82,7 @@ def test_what_a_run_measured_is_kept_as_far_as_somebody_could_have_measured_it_b
     measured.keep_tile(65536)
     assert measured.inference_tile_points == 65536
     measured.keep_tile(1 << 22)  # of a GPU
-    assert measured.inference_tile_points == tile_size.MOST_CPU_TILE_POINTS
+    assert measured.inference_tile_points == MOST_CPU_TILE_POINTS
     named = TrainerSettings(accelerator="cpu", tile_points=99)
     named.keep_tile(65536)
     assert named.inference_tile_points == 99

@@ -21,7 +21,7 @@ from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 TILE, SIZE, UNIT = 1 << 15, 33, 50.0
 TURN = upright_rotation(torch.tensor([1.0, 0.0, 0.0]))

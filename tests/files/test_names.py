@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from support.running import refused
 
-from nerf_lightning.cli.sweep_arguments import sweep_arguments
+from nerf_lightning.cli.prepare import sweep_arguments
 from nerf_lightning.files.folders import PACKAGE
 from nerf_lightning.files.made_folders import child_of, file_name
 

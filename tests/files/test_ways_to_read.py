@@ -14,8 +14,7 @@ OURS = {
     "config/instantiate.py": ["load"],
     "extensions/viewer/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
-    "cli/loading.py": ["print"],
-    "cli/process.py": ["print", "print", "open"],
+    "cli/process.py": ["print", "print", "print", "open"],
     "__init__.py": ["read_text"],
     "cli/help.py": ["read_text"],
     "config/help/docstrings.py": ["read_text"],

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nerf_lightning.compute.devices import prepare_machine
-from nerf_lightning.selftest.scene import FOCAL, NUM_VIEWS, ball_scene
+from nerf_lightning.selftest.training import FOCAL, NUM_VIEWS, ball_scene
 
 CHOSEN = os.environ.get("NERF_LIGHTNING_GPU_TESTS_ON", "cuda")
 

@@ -17,8 +17,7 @@ from support.gpu_training import default_callbacks, step_by_step
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
-from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.selftest.training import METHODS
+from nerf_lightning.selftest.training import METHODS, ball_scene
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.system import RadianceFieldSystem
 

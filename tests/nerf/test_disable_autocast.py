@@ -15,7 +15,7 @@ from support.scenes import tiny_field
 import nerf_lightning
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.metrics import image_metrics
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 PACKAGE = Path(nerf_lightning.__file__).parent
 ROOMS = (

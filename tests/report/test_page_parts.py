@@ -8,9 +8,8 @@ from PIL import Image
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
-from nerf_lightning.report.embedding import LONGEST_SIDE, embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
-from nerf_lightning.report.page import Report, write_report
+from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, embedded_video, write_report
 
 
 def decoded(picture):

@@ -9,8 +9,8 @@ import yaml
 
 from nerf_lightning.runs.published import published_for
 from nerf_lightning.runs.summary import read_run
+from nerf_lightning.runs.sweep import job_rows
 from nerf_lightning.runs.sweep_job import JobRecord, read_records
-from nerf_lightning.runs.sweep_table import job_rows
 from nerf_lightning.runs.table_files import write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 

@@ -9,7 +9,7 @@ from support.made_once import made_once
 
 LOADING = """
 import gc, sys, warnings
-from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.cli.process import quick_imports
 with quick_imports():
     print(gc.isenabled())
     import nerf_lightning.commands.train

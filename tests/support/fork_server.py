@@ -227,7 +227,7 @@ def stop() -> None:
 def import_everything() -> None:
     """Import what any command may need."""
     import nerf_lightning
-    from nerf_lightning.cli.loading import quick_imports
+    from nerf_lightning.cli.process import quick_imports
 
     ours = (module.name for module in pkgutil.walk_packages(nerf_lightning.__path__, "nerf_lightning."))
     with quick_imports():

@@ -13,7 +13,7 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.selftest.scene import ball_scene
+from nerf_lightning.selftest.training import ball_scene
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

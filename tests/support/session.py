@@ -56,7 +56,7 @@ atexit.register(_leave)
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
     """Import the tests, and all that they import, as quickly as the commands import what they need."""
-    from nerf_lightning.cli.loading import quick_imports
+    from nerf_lightning.cli.process import quick_imports
 
     with quick_imports():
         collected = yield

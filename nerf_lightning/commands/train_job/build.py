@@ -24,10 +24,8 @@ from nerf_lightning.runs.resume import former_config
 from nerf_lightning.runs.run_folder import job_folder
 from nerf_lightning.runs.sweep_job import stop_file
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
-from nerf_lightning.training.callbacks.folder_guard import FolderGuard
-from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.callbacks.time_budget import TimeBudget
-from nerf_lightning.training.callbacks.training_time import TrainingTime
+from nerf_lightning.training.callbacks.stop_signals import FolderGuard, StopSignals
+from nerf_lightning.training.callbacks.time_budget import TimeBudget, TrainingTime
 from nerf_lightning.training.launch.processes import require_one_task
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.loggers import WeightsAndBiases

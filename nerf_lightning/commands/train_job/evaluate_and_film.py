@@ -15,8 +15,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.evaluation.metric_lines import metric_lines
-from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.evaluation.protocol import measured_of, metric_lines
 from nerf_lightning.export.base import Export
 from nerf_lightning.messages.console import say
 from nerf_lightning.nerf.models.base import Model, point_field, show_photographs

@@ -14,7 +14,7 @@ from nerf_lightning.data.sfm.settings import SfmSettings
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, child_of, empty_ours, make_folder, remove_empty
-from nerf_lightning.messages.console import StageProgress
+from nerf_lightning.messages.console import StageProgress, spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -133,3 +133,44 @@ def _publish(work: Path, folder: Path) -> None:
     if (work / "images").exists():
         (work / "images").rename(folder / "images")
     (work / "sparse" / "0").rename(make_folder(folder, "sparse") / "0")
+
+
+# Share of the photographs: if fewer were registered, give advice.
+ENOUGH = 0.8
+
+
+def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Path, seconds: float) -> list[str]:
+    """Return what was found and written to `folder` as lines, with advice if it is little."""
+    found, total = len(model.registered), len(model.registered) + len(model.left_out)
+    what = "frames" if is_video else "photographs"
+    cameras = "one camera" if model.num_cameras == 1 else f"{model.num_cameras} cameras"
+    lines = [
+        f"registered          {found} of {total} {what} ({cameras}, {matching} matching)",
+        f"reprojection error  {model.reprojection_error:.2f} px",
+        f"points              {model.num_points}",
+        f"time                {spoken(seconds)}",
+        f"written             {folder}",
+    ]
+    if model.left_out:
+        lines.append(f"left out            {listed(model.left_out)}")
+    return [*lines, *remarks(model, matching, is_video)]
+
+
+def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
+    """Return what to do differently, if anything."""
+    lines = []
+    if model.apart:
+        lines.append(
+            f"{listed(model.apart, 4)} fit together but not with the rest: if they show another place, make a separate "
+            "capture of them; if not, photographs between the two are missing."
+        )
+    if len(model.registered) < ENOUGH * (len(model.registered) + len(model.left_out)):
+        more = (
+            "film slowly, walking rather than turning; a smaller every= takes more frames of this video."
+            if is_video
+            else "take more photographs between those left out and the others (overlapping by two thirds), sharp ones, "
+            "with one zoom and from positions a few steps apart."
+        )
+        pairs = " matching=exhaustive compares every photograph with every other." if matching == "sequential" else ""
+        lines.append(f"few were registered: {more}{pairs}")
+    return lines

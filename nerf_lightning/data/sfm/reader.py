@@ -11,11 +11,10 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoded_photographs import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.colmap import ColmapReader
-from nerf_lightning.data.sfm.find_poses import from_photographs, from_video
+from nerf_lightning.data.sfm.find_poses import from_photographs, from_video, remarks
 from nerf_lightning.data.sfm.photograph_folder import files_in
 from nerf_lightning.data.sfm.reconstruction import require_pycolmap
 from nerf_lightning.data.sfm.settings import Panoramas, SfmSettings
-from nerf_lightning.data.sfm.summary import remarks
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.made_folders import make_own_folder
 from nerf_lightning.messages.errors import InputError

@@ -14,8 +14,7 @@ from nerf_lightning.nerf.models.tiles import tiles, weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.ray_statistics import median_distances
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import PixelIndex, Points, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes

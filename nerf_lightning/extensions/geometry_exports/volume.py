@@ -18,7 +18,7 @@ from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 

@@ -14,8 +14,7 @@ from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import weighted_renderings
 from nerf_lightning.nerf.randomness import batch_random, fold
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
+from nerf_lightning.nerf.types.rays import PixelIndex, Points, RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 NUM_RAYS = 2048

@@ -22,7 +22,7 @@ from nerf_lightning.extensions.viewer.training_switch import TrainingSwitch
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.callbacks.training_time import Clocked
+from nerf_lightning.training.callbacks.time_budget import Clocked
 
 # Steps take time, so a picture may, too.
 MOVING_SECONDS = 0.5

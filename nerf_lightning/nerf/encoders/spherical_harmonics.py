@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
+from nerf_lightning.nerf.kernels.backends import with_kernel
 
 # Normalized so that the integral of each squared function over the sphere is one (Condon-Shortley phase included).
 DEGREE_1 = 0.28209479177387814  # 1 / (2 sqrt(pi))

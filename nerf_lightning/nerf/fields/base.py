@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 

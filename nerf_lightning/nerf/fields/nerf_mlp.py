@@ -14,7 +14,7 @@ from nerf_lightning.nerf.geometry.boxes import require_box
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.matmul_precision import Linear, linear
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -19,7 +19,7 @@ from nerf_lightning.nerf.kernels.mlp.op import mlp
 from nerf_lightning.nerf.kernels.render.op import FieldParts
 from nerf_lightning.nerf.matmul_precision import linear
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 

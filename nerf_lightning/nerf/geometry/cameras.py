@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.lenses import project_plane, stretches, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras

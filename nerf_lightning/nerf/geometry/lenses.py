@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.panoramas import panorama_stretches, project_panorama, unproject_panorama
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.types.scene import LensModel
 
 NEWTON_STEPS = 8

@@ -1,4 +1,6 @@
-"""A working frame for a capture: which way is up, where the middle is, and how large a unit is."""
+"""A working frame for a capture: which way is up, where the middle is, how large a unit is; and where cameras look."""
+
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Float64
@@ -6,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.nerf.matmul_precision import disable_autocast
-from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
+from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 FORWARD_FACING = 0.82
 """Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees)."""
@@ -183,3 +185,20 @@ def told_length(record: SceneRecord) -> tuple[float, str]:
     if record.metres_per_unit is None:
         return unit, "the capture's units"
     return unit * record.metres_per_unit, "meters"
+
+
+def middle_of(scene: SceneRecord) -> Float[Tensor, "3"]:
+    """Return the middle that the views are around: that of the box, or where the cameras' axes meet."""
+    if scene.space == "bounded":
+        return scene.aabb.mean(dim=0)
+    if scene.space == "ndc" and isinstance(scene, Scene) and len(scene.points):
+        return scene.points.median(dim=0).values
+    if scene.space == "ndc":
+        return torch.tensor([0.0, 0.0, -2.0])
+    return middle_of_cameras(replace(scene.cameras, c2w=scene.cameras.c2w.double())).float()
+
+
+def directions_seen(scene: SceneRecord) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
+    """Return azimuth (from x toward y) and elevation in degrees of each camera, as seen from the middle."""
+    x, y, z = (scene.cameras.c2w[:, :, 3] - middle_of(scene)).unbind(dim=-1)
+    return torch.atan2(y, x).rad2deg(), torch.atan2(z, (x.square() + y.square()).sqrt()).rad2deg()

@@ -10,7 +10,7 @@ from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.rendering.ragged import sum_over_rays
+from nerf_lightning.nerf.rendering.quadrature import sum_over_rays
 from nerf_lightning.nerf.types.rays import RayBundle, Target
 from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 

@@ -14,8 +14,7 @@ from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.part import Part, parts_of
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import Points, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 from nerf_lightning.nerf.types.scene import Background, Scene
 

@@ -13,8 +13,7 @@ from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import Points, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -11,8 +11,7 @@ from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.part import Part, coupled_parts
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import Sampler
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import Points, RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
 
 

@@ -13,8 +13,7 @@ from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import Sampler
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import Points, RayBundle
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
 

@@ -11,8 +11,7 @@ from nerf_lightning.nerf.models.base import PointField
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.ray_generator import Subpixels
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import Points, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 
 

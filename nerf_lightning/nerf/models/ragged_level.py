@@ -21,7 +21,7 @@ from nerf_lightning.nerf.kernels.render.op import (
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.part import Part, StepContext
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.quadrature import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler, Sampler
 from nerf_lightning.nerf.samplers.early_termination import LEAST_ALPHA, render_until_opaque, visible_samples

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.kernels.search import search
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
 
 
 @with_kernel("histograms.cpu", "histograms.cuda")

@@ -5,13 +5,15 @@ T_i = exp(-sum_{j<i} sigma_j delta_j) the light that reaches its start, w_i = T_
 The kernels in `kernels/ragged` and `kernels/render` compute the same, and must change with it.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.ragged.op import integrate_dense
-from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
-from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
+from nerf_lightning.nerf.kernels.ragged.op import integrate, integrate_dense
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, RaggedRendering
 
 
 def weights_from_density(
@@ -80,3 +82,29 @@ def rendering_of(
     opacity, depth = weights.sum(dim=-1), (weights * samples.midpoints).sum(dim=-1)
     of_the_kind = {"weights": weights, "samples": samples, "channels": channels or {}}
     return DenseRendering.from_sums(rays, background, foreground, opacity, depth, **of_the_kind)
+
+
+def composite_ragged(
+    output: FieldOutput,
+    samples: RaggedSamples,
+    rays: RayBundle,
+    background: Float[Tensor, "rays 3"] | None,
+) -> RaggedRendering:
+    """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
+
+    Args:
+        output: density and color at the samples' midpoints.
+        samples: the intervals.
+        rays: the rays, with far.
+        background: color behind each ray; None leaves the rays open in front of black.
+    """
+    *sums, weights = integrate(output.density, output.rgb, samples)
+    channels = {name: sum_over_rays(weights[:, None] * each, samples) for name, each in output.channels.items()}
+    of_the_kind: dict[str, Any] = {"weights": weights, "samples": samples, "channels": channels}
+    return RaggedRendering.from_sums(rays, background, *sums, **of_the_kind)
+
+
+def sum_over_rays(values: Float[Tensor, "capacity n"], samples: RaggedSamples) -> Float[Tensor, "rays n"]:
+    """Return the sum of each ray's values."""
+    total = values.new_zeros(samples.bounds.shape[0] - 1, values.shape[1])
+    return total.index_add(0, samples.ray_index, values)

@@ -6,8 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cones import cone_covariance
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
-from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import Points, RaggedSamples, RayBundle, RaySamples
 
 
 def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None, cones: bool = False) -> Points:

@@ -8,7 +8,7 @@ from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.ragged.op import first_of_each_ray, num_visible
 from nerf_lightning.nerf.kernels.render.op import sample_density
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.quadrature import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle

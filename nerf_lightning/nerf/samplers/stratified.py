@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
-from nerf_lightning.nerf.kernels.with_kernel import with_kernel
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples

@@ -1,4 +1,4 @@
-"""Rays, where they are sampled, and the pixels that they belong to."""
+"""Rays, where they are sampled, the points at which fields are evaluated, and the pixels that rays belong to."""
 
 from dataclasses import dataclass, replace
 
@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from nerf_lightning.nerf.randomness import PointRandom
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 
@@ -184,3 +185,23 @@ class Target(TensorStruct):
     """Weight of each distance, in [0, 1]; 0 where it is unknown."""
     infinity: Float[Tensor, "*rays"] | None = None
     """Distance along each ray at which the world ends, in normalized device coordinates; None: nowhere."""
+
+
+@dataclass(frozen=True)
+class Points(TensorStruct):
+    """Points in space, with the directions and photographs from which they are seen.
+
+    What all samples of a ray share (its direction, its photograph) is stored once, with an axis of length 1.
+    """
+
+    positions: Float[Tensor, "*points 3"]
+    """Positions in scene units."""
+    directions: Float[Tensor, "*#points 3"] | None = None
+    """Unit length, from the camera to the point; None if only density is needed."""
+    photograph: Int[Tensor, "*#points"] | None = None
+    """Number of the view whose photograph is explained; None outside training steps (`RayBundle.photograph`)."""
+    random: PointRandom | None = None
+    """The step's random numbers; None outside training steps."""
+    covariance: Float[Tensor, "*points 6"] | None = None
+    """Covariance of the part of its pixel's cone that a sample represents (`geometry.cones`), scene units squared; None
+    if unused (`Field.sees_cones`), or if a point belongs to no pixel."""

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.config.setting_rules import meaning_of, names_a_class
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
-from nerf_lightning.training.tensorboard import shown_name
+from nerf_lightning.training.loggers import shown_name
 
 MOST = 15
 """Maximum number of columns of the hyperparameter table: with more, those that matter are hard to find."""

@@ -13,8 +13,8 @@ from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.watcher import Watcher, tensorboard_writers
+from nerf_lightning.training.loggers import ALONG_RAYS, PER_RAY
 from nerf_lightning.training.step import TrainStep
-from nerf_lightning.training.tensorboard import ALONG_RAYS, PER_RAY
 
 PARTS = 50
 

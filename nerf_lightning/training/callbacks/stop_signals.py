@@ -1,4 +1,4 @@
-"""On Ctrl-C, SIGTERM, a scheduler's signal or a sweep's stop: finish the step, save, stop; a resume is bit-exact."""
+"""On Ctrl-C, SIGTERM, a scheduler's signal or a sweep's stop: finish the step, save, stop; without its folder, stop."""
 
 import os
 import signal
@@ -10,6 +10,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
+from nerf_lightning.files.made_folders import require_run
 from nerf_lightning.messages.exit_codes import OF_SIGNALS
 from nerf_lightning.training.launch.preemption import stop_signals
 
@@ -75,3 +76,16 @@ class StopSignals(Callback):
         if self.heard and number == signal.SIGINT:
             os._exit(OF_SIGNALS + number)  # an exception would be caught on the way, and the process would linger
         self.heard, self.received = True, number
+
+
+class FolderGuard(Callback):
+    """Check after each step that the run folder still exists, before anything is written."""
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Stop if it does not.
+
+        Raises:
+            InputError: the folder was deleted, moved or renamed.
+        """
+        if trainer.is_global_zero:
+            require_run(Path(trainer.default_root_dir))

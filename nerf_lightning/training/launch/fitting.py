@@ -23,7 +23,7 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.part import coupled_parts
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
-from nerf_lightning.training.launch.strategy import OneSumPerStep
+from nerf_lightning.training.launch.trainer import OneSumPerStep
 from nerf_lightning.training.step import TrainStep
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ def _of_devices(trainer: Trainer) -> Iterator[str]:
     if trainer.world_size > 1 and not isinstance(trainer.strategy, OneSumPerStep):
         yield (
             "With several devices Lightning's Trainer would add up gradients in each tile of a step. Use nerf train "
-            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.strategy."
+            "trainer=ddp, or Trainer(strategy=OneSumPerStep()) of nerf_lightning.training.launch.trainer."
         )
 
 

@@ -19,7 +19,7 @@ from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, Simpl
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from nerf_lightning.config.instantiate import require_fitting
-from nerf_lightning.config.lightning_arguments import OWNED
+from nerf_lightning.config.setting_rules import LIGHTNING_ARGUMENTS
 from nerf_lightning.messages.errors import InputError
 
 DEFAULTS: dict[str, Any] = {"num_sanity_val_steps": 0, "enable_model_summary": False, "log_every_n_steps": 1}
@@ -48,8 +48,9 @@ def passed_through(flags: object) -> dict[str, Any]:
         )
     known = inspect.signature(Trainer).parameters
     for name, value in flags.items():
-        if name in OWNED:
-            raise InputError(f"trainer.lightning.{name}={value}: the setting for this is {OWNED[name]}. Use that one.")
+        if name in LIGHTNING_ARGUMENTS:
+            replaced_by = LIGHTNING_ARGUMENTS[name]
+            raise InputError(f"trainer.lightning.{name}={value}: the setting for this is {replaced_by}. Use that one.")
         if name not in known:
             raise InputError(
                 f"trainer.lightning.{name}={value}: Lightning's Trainer has no such argument. {_near(name)}"
@@ -84,8 +85,8 @@ def written_to(folder: Path, flags: dict[str, Any]) -> dict[str, Any]:
 
 
 def _near(name: str) -> str:
-    offered = sorted(set(inspect.signature(Trainer).parameters) - OWNED.keys())
-    close = difflib.get_close_matches(name, [*offered, *OWNED], n=3)
+    offered = sorted(set(inspect.signature(Trainer).parameters) - LIGHTNING_ARGUMENTS.keys())
+    close = difflib.get_close_matches(name, [*offered, *LIGHTNING_ARGUMENTS], n=3)
     return f"Did you mean {' or '.join(close)}?" if close else f"It has {', '.join(offered)}."
 
 

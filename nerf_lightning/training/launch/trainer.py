@@ -8,7 +8,9 @@ from typing import Any, Literal
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
+from lightning.pytorch.strategies import DDPStrategy
 from torch import distributed
+from torch.nn import Module
 
 from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator
 from nerf_lightning.compute.precision import Precision
@@ -19,8 +21,21 @@ from nerf_lightning.training.gradients.recorded import not_replayed
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
-from nerf_lightning.training.launch.strategy import OneSumPerStep
 from nerf_lightning.training.step import TrainStep
+
+
+class OneSumPerStep(DDPStrategy):
+    """Leave the module unwrapped: the system sums the gradients once per step, after the last tile.
+
+    DDP's wrapper would do so in each tile's backward pass, and requires every parameter to get a gradient there.
+    """
+
+    def _setup_model(self, model: Module) -> Module:  # type: ignore[override]
+        return model
+
+    def _register_ddp_hooks(self) -> None:
+        pass
+
 
 MOST_EPOCHS = MOST_STEPS = 1 << 31
 

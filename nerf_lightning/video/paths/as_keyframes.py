@@ -10,8 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
 from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.video.paths.base import CameraPath, PathFrame
-from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
-from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframe_path import KeyframeCurve, KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, Point
 
 MOST = 24

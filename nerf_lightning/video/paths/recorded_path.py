@@ -15,7 +15,7 @@ from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.video.paths.base import PathFrame
-from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve, keyframe_focal, keyframe_poses
+from nerf_lightning.video.paths.keyframe_path import KeyframeCurve, keyframe_focal, keyframe_poses
 from nerf_lightning.video.paths.keyframes import Keyframe, read_keyframes, write_keyframes
 
 USUAL_SECONDS = 2.0

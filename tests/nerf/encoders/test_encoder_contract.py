@@ -7,7 +7,7 @@ from support.configs import composed, options
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.encoders.base import Encoder
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 CONSTANT = "spherical_harmonics_1"
 """Says nothing of what it is given, on purpose."""

@@ -17,8 +17,8 @@ from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.part import parts_of
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
-from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.fitting import require_one_process
 from nerf_lightning.training.launch.trainer import TrainerSettings

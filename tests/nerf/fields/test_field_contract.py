@@ -6,7 +6,7 @@ from support.configs import composed, options
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 
 @pytest.fixture(params=options("field"))

@@ -8,7 +8,7 @@ from torch import nn
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 
 def paper_field(**changes):

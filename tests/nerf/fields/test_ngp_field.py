@@ -16,7 +16,7 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.part import fit_parts
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 
 def a_field(**settings):

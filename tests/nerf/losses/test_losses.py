@@ -16,8 +16,7 @@ from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.quadrature import composite, composite_ragged
 from nerf_lightning.nerf.types.rays import PixelIndex, RaggedSamples, RayBundle, RaySamples, Target
 from nerf_lightning.nerf.types.renderings import FieldOutput
 

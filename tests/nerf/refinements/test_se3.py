@@ -27,7 +27,7 @@ from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.refinements.base import NoRefinement
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
-from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.quadrature import composite_ragged
 from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.early_termination import visible_samples
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler

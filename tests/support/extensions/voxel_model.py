@@ -9,7 +9,7 @@ from nerf_lightning.nerf.models.base import PointField
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 

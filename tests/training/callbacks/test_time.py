@@ -15,16 +15,15 @@ from lightning.pytorch import Trainer
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import run_folder as folders
 from nerf_lightning.runs.run_folder import RunFolder
-from nerf_lightning.training.callbacks import training_time
+from nerf_lightning.training.callbacks import time_budget
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
-from nerf_lightning.training.callbacks.time_budget import TimeBudget
-from nerf_lightning.training.callbacks.training_time import Clocked, TrainingTime
+from nerf_lightning.training.callbacks.time_budget import Clocked, TimeBudget, TrainingTime
 from nerf_lightning.training.launch.trainer import MOST_STEPS
 
 
 def test_steps_are_counted_and_pauses_are_not(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(training_time.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time_budget.time, "monotonic", lambda: now[0])
     clock = TrainingTime()
     assert isinstance(clock, Clocked)
     trainer = create_autospec(Trainer, instance=True)

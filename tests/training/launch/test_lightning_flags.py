@@ -11,8 +11,9 @@ from support.running import refused
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import open_sections
+from nerf_lightning.config.setting_rules import LIGHTNING_ARGUMENTS
 from nerf_lightning.runs.identity import run_identity, settings_digest
-from nerf_lightning.training.launch.lightning_flags import OWNED, passed_through
+from nerf_lightning.training.launch.lightning_flags import passed_through
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
@@ -35,15 +36,15 @@ def test_a_run_that_tries_everything_once_is_as_short(given, steps):
     assert settings.num_steps(1000, 10, 0) == steps
 
 
-@pytest.mark.parametrize("flag", sorted(OWNED))
+@pytest.mark.parametrize("flag", sorted(LIGHTNING_ARGUMENTS))
 def test_what_is_ours_to_say_is_refused_with_our_name(flag):
-    refused(passed_through, {flag: 1}, parts=(f"trainer.lightning.{flag}=1", OWNED[flag]))
+    refused(passed_through, {flag: 1}, parts=(f"trainer.lightning.{flag}=1", LIGHTNING_ARGUMENTS[flag]))
 
 
 def test_every_argument_is_passed_through_or_ours():
     known = set(inspect.signature(Trainer).parameters)
-    assert known >= OWNED.keys()
-    assert known - OWNED.keys() == {
+    assert known >= LIGHTNING_ARGUMENTS.keys()
+    assert known - LIGHTNING_ARGUMENTS.keys() == {
         "fast_dev_run", "limit_val_batches", "num_sanity_val_steps", "log_every_n_steps", "enable_model_summary",
         "benchmark", "inference_mode", "profiler", "detect_anomaly", "enable_autolog_hparams",
     }  # fmt: skip

@@ -14,8 +14,7 @@ from nerf_lightning.nerf.geometry.world_frame import similarity
 from nerf_lightning.video.paths.as_keyframes import MOST, as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import frame_of
-from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
-from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframe_path import KeyframeCurve, KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.paths.photograph_path import PhotographPath

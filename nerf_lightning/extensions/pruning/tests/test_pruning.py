@@ -23,7 +23,7 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
-from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import Points
 
 
 def test_what_counts_most_stays():
