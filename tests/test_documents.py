@@ -134,8 +134,13 @@ def test_the_experiment_of_ones_own_composes(tmp_path):
     (example,) = blocks("docs/experiments.md", "yaml")
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "castle.yaml").write_text(example, encoding="utf-8")
-    config, choices = compose_config("train", [f"hydra.searchpath=[file://{tmp_path}]", "experiment=castle"])
-    assert (config.scene.root, config.trainer.max_steps, choices["model"]) == ("data/castle", 5000, "fast_proposal")
+    asked = compose_config("train", [f"hydra.searchpath=[file://{tmp_path}]", "experiment=castle"])
+    config = asked.config
+    assert (config.scene.root, config.trainer.max_steps, asked.choices["model"]) == (
+        "data/castle",
+        5000,
+        "fast_proposal",
+    )
 
 
 def test_the_loss_in_a_file_of_ones_own_trains(tmp_path, monkeypatch):
@@ -198,7 +203,7 @@ def known_settings():
     for conf, file in ((folder, file) for folder in conf_folders() for file in folder.rglob("*.yaml")):
         text = file.read_text(encoding="utf-8")
         group = file.relative_to(conf).parent.as_posix()
-        shared = {"capture": "scene"}.get(file.stem, "") if group == "." else group
+        shared = {"capture_defaults": "scene"}.get(file.stem, "") if group == "." else group
         prefix = "" if "@package _global_" in text else shared.replace("/", ".")
         gather(yaml.safe_load(text) or {}, prefix)
         if group == "what":

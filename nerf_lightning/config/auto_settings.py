@@ -5,14 +5,15 @@ Each choice is logged in one line, with the setting that changes it.
 
 import copy
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from omegaconf import DictConfig
 
-from nerf_lightning.config.compose import chosen, compose_config
+from nerf_lightning.config.compose import Composed, compose_config
 from nerf_lightning.config.model_for_scene import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
-from nerf_lightning.config.overrides import key_of, leaves
+from nerf_lightning.config.overrides import SWITCH, key_of, leaves
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
@@ -66,40 +67,25 @@ GPU_BATCHES = {
 log = logging.getLogger(__name__)
 
 
-def with_longest(
-    config: DictConfig, overrides: Sequence[str], on_gpu: bool, former: Mapping[str, Any] | None
-) -> DictConfig:
-    """Return the config with the size of photographs that a GPU has time for, unless the user has typed one.
-
-    A resumed run (`former`: its config) keeps its own.
-    """
-    begun = None if former is None else _number(former, LONGEST_SETTING)
-    if "longest" not in config.scene or LONGEST_SETTING in map(key_of, overrides) or not (begun or on_gpu):
-        return config
-    config = copy.deepcopy(config)
-    config.scene.longest = int(begun or GPU_LONGEST)
-    return config
+def with_longest(asked: Composed, on_gpu: bool) -> Composed:
+    """Return the config with the size of photographs that a GPU has time for, unless the user has typed one."""
+    begun = None if asked.former is None else _number(asked.former, LONGEST_SETTING)
+    if "longest" not in asked.config.scene or LONGEST_SETTING in asked.typed or not (begun or on_gpu):
+        return asked
+    return asked.with_setting(LONGEST_SETTING, int(begun or GPU_LONGEST))
 
 
-def takes_distances(choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene) -> bool:
+def takes_distances(asked: Composed, scene: Scene) -> bool:
     """Return whether a run learns from known distances: with loss=depth, which model=auto chooses for photographs."""
-    if "loss" in map(key_of, overrides) or choices.get("model") != AUTO:
-        return choices.get("loss") == "depth"
+    if "loss" in asked.typed or asked.choices.get("model") != AUTO:
+        return asked.choices.get("loss") == "depth"
     return model_for(scene)[0] == PHOTOGRAPHS
 
 
-def resolve_auto(
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    scene: Scene,
-    device_type: str = "cpu",
-    former: Mapping[str, Any] | None = None,
-) -> tuple[DictConfig, dict[str, str]]:
-    """Return the config with every choice made, and the names picked from each group.
+def resolve_auto(asked: Composed, scene: Scene, device_type: str = "cpu") -> Composed:
+    """Return the config with every choice made for its scene.
 
-    `choices` are those picked so far, and `overrides` what the config was composed with. A resumed run
-    (`former`: its config) keeps what was chosen for it, on any device and for any length.
+    A resumed run keeps what was chosen for it, on any device and for any length.
 
     The length of a run is what is typed: `trainer.max_steps` or `trainer.max_epochs`, `budget.seconds`, or the shorter
     of both. Without either, a run takes CPU_SECONDS on a CPU, and the model's published steps on other devices.
@@ -107,7 +93,7 @@ def resolve_auto(
     Raises:
         InputError: a setting that is neither a value nor auto.
     """
-    config = copy.deepcopy(config)
+    config, former = asked.config, asked.former
     is_capture = config.scene.get("root", "") != "" and scene.capture_of is None  # of an archive it is empty
     seconds = config.budget.seconds
     if seconds == AUTO:
@@ -115,10 +101,11 @@ def resolve_auto(
         seconds = CPU_SECONDS if device_type == "cpu" and not has_steps else None
         if former is not None and not has_steps:
             seconds = _number(former, "budget.seconds")
-    config, choices = fit_model("train", config, choices, overrides, scene, device_type == "cuda", seconds, former)
+    fitted = fit_model(asked, scene, device_type == "cuda", seconds)
+    config = copy.deepcopy(fitted.config)
     _settle(config, "doctor", is_capture)
     _settle(config.final, "report", is_capture)
-    writes_page = _writes_page(config, choices, is_capture, seconds)
+    writes_page = is_capture and _writes_page(fitted, seconds)
     if writes_page:
         if config.budget.seconds == AUTO and former is None:
             seconds = CPU_SECONDS - PAGE_SECONDS
@@ -135,12 +122,12 @@ def resolve_auto(
             config.evaluation.max_views = _number(former, "evaluation.max_views")
         else:
             config.evaluation.max_views = _views_for(scene, config) if device_type == "cpu" else None
-    return config, chosen(choices)
+    return replace(fitted, config=config)
 
 
-def _writes_page(config: DictConfig, choices: Mapping[str, Any], is_capture: bool, seconds: int | float | None) -> bool:
-    """Return whether the page of the scene is written although it was not requested."""
-    photographs = is_capture and choices.get("model") == PHOTOGRAPHS and config.final.get("page") == AUTO
+def _writes_page(asked: Composed, seconds: int | float | None) -> bool:
+    """Return whether the page of a capture is written although it was not requested."""
+    photographs = asked.choices.get("model") == PHOTOGRAPHS and asked.config.final.get("page") == AUTO
     return photographs and seconds is not None and seconds >= PAGE_FROM and "page" in option_names("what")
 
 
@@ -169,27 +156,20 @@ def _number(config: Mapping[str, Any], key: str) -> int | float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-def fit_model(
-    command: str,
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    scene: Scene,
-    on_gpu: bool,
-    seconds: int | float | None = None,
-    former: Mapping[str, Any] | None = None,
-) -> tuple[DictConfig, Mapping[str, Any]]:
-    """Return a command's config with what model=auto means for a scene, if it was chosen, and the names picked.
+def fit_model(asked: Composed, scene: Scene, on_gpu: bool, seconds: int | float | None = None) -> Composed:
+    """Return a config with what model=auto means for a scene, if it was chosen; what the user has typed stays.
 
-    `seconds` of training; None: unknown. `former` is the config of the run that is resumed. What the user has typed
-    stays.
+    `seconds` of training; None: unknown.
     """
-    if choices.get("model") != AUTO:
-        return config, choices
-    suited = _for_scene(scene, overrides, on_gpu, seconds) if former is None else _as_begun(scene, overrides, former)
-    fitted, picked = compose_config(command, [*overrides, *suited])
-    fitted.paths, fitted.scene = config.paths, config.scene
-    return fitted, picked
+    if asked.choices.get("model") != AUTO:
+        return asked
+    typed, former = asked.typed, asked.former
+    fitted = asked.composed_with(
+        _for_scene(scene, typed, on_gpu, seconds) if former is None else _as_begun(scene, typed, former)
+    )
+    for section in {"paths", "scene", "final"} & asked.config.keys():  # settled by now
+        fitted.config[section] = asked.config[section]
+    return fitted
 
 
 def settled(config: Mapping[str, Any]) -> list[str]:
@@ -201,7 +181,7 @@ def settled(config: Mapping[str, Any]) -> list[str]:
     return [f"{key}={values[key]}" for key in SETTLED if type(values.get(key)) is int]
 
 
-def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
+def _for_scene(scene: Scene, typed: set[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
     """Return the model that suits a scene, with what suits the model, and log it."""
     name, reason = model_for(scene)
     large = _has_large_pictures(scene)
@@ -211,20 +191,20 @@ def _for_scene(scene: Scene, overrides: Sequence[str], on_gpu: bool, seconds: in
     suited = [f"model={name}"]
     short = seconds is not None and seconds < (SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS)
     if name == IN_A_BOX and not on_gpu:
-        suited += _for_large_pictures(overrides, short) if large else []
-        suited += [] if short else _rays(overrides)
+        suited += _for_large_pictures(typed, short) if large else []
+        suited += [] if short else _rays(typed)
     if name == PHOTOGRAPHS:
-        suited += [*_grid_for_photographs(scene, overrides, short), *_loss_for(scene, overrides)]
-    return suited + (_for_gpu(name, overrides) if on_gpu else [])
+        suited += [*_grid_for_photographs(scene, typed, short), *_loss_for(scene, typed)]
+    return suited + (_for_gpu(name, typed) if on_gpu else [])
 
 
-def _as_begun(scene: Scene, overrides: Sequence[str], former: Mapping[str, Any]) -> list[str]:
+def _as_begun(scene: Scene, typed: set[str], former: Mapping[str, Any]) -> list[str]:
     """Return the model of a run that is resumed, and the numbers that were chosen for it."""
-    typed, name = set(map(key_of, overrides)), model_for(scene)[0]
+    name = model_for(scene)[0]
     numbers = [each for each in settled(former) if key_of(each) not in typed]
     if _has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
         name = LARGE
-    loss = _loss_for(scene, overrides) if name == PHOTOGRAPHS else []
+    loss = _loss_for(scene, typed) if name == PHOTOGRAPHS else []
     return [f"model={name}", *loss, *numbers]
 
 
@@ -232,9 +212,9 @@ def _has_large_pictures(scene: Scene) -> bool:
     return model_for(scene)[0] == IN_A_BOX and grid_for(scene) >= LARGE_CELLS
 
 
-def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
+def _for_large_pictures(typed: set[str], short: bool) -> list[str]:
     """Return the steps, grid and layers that suit large pictures of a scene in a box; what the user has typed stays."""
-    typed, suited = set(map(key_of, overrides)), []
+    suited = []
     if STEPS_SETTING not in typed:
         steps = SHORT_STEPS if short else LARGE_STEPS
         log.info("steps: %d across the box, because the pictures are large (%s=N)", steps, STEPS_SETTING)
@@ -247,13 +227,13 @@ def _for_large_pictures(overrides: Sequence[str], short: bool) -> list[str]:
     return suited
 
 
-def _rays(overrides: Sequence[str]) -> list[str]:
+def _rays(typed: set[str]) -> list[str]:
     """Return several rays for each pixel, unless the user has typed their number.
 
     After 100 s, Lego at 200 x 200 has 34.58 dB with 2 x 2 rays and 33.64 dB with one; at 800 x 800, it has 33.90 and
     33.76 dB after 300 s, and 35.13 and 34.79 dB after 1200 s.
     """
-    if {RAYS_SETTING, "loss"} & set(map(key_of, overrides)):
+    if {RAYS_SETTING, "loss"} & typed:
         return []
     log.info(
         "rays: 2 x 2 through each pixel at the end of the run, for sharper pictures (%s=1 renders four times as fast)",
@@ -274,9 +254,9 @@ def _grid(resolution: int, table: int, cause: str) -> list[str]:
     return [f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
 
 
-def _grid_for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -> list[str]:
+def _grid_for_photographs(scene: Scene, typed: set[str], short: bool) -> list[str]:
     """Return the grid that suits photographs; what the user has typed stays. `short`: whether the run is short."""
-    if GRID_SETTINGS & set(map(key_of, overrides)):
+    if GRID_SETTINGS & typed:
         return []
     few = scene.depths is None and len(scene.splits["train"]) < FEW_PHOTOGRAPHS
     pixels = grid_for(scene)
@@ -286,9 +266,9 @@ def _grid_for_photographs(scene: Scene, overrides: Sequence[str], short: bool) -
     return _grid(resolution, 18 if short else TABLE_SIZES[resolution], wide)
 
 
-def _loss_for(scene: Scene, overrides: Sequence[str]) -> list[str]:
+def _loss_for(scene: Scene, typed: set[str]) -> list[str]:
     """Return the loss that suits photographs, unless the user has typed one."""
-    if scene.depths is None or "loss" in map(key_of, overrides):
+    if scene.depths is None or "loss" in typed:
         return []
     log.info(
         "loss: depth, since the distance of %s pixels is known (loss=proposal ignores it)", f"{len(scene.depths):,}"
@@ -296,46 +276,37 @@ def _loss_for(scene: Scene, overrides: Sequence[str]) -> list[str]:
     return ["loss=depth"]
 
 
-def _for_gpu(model: str, overrides: Sequence[str]) -> list[str]:
+def _for_gpu(model: str, typed: set[str]) -> list[str]:
     """Return the batches of a model on a GPU; what the user has typed stays."""
-    typed = set(map(key_of, overrides))
     larger = [f"{key}={value}" for key, value in GPU_BATCHES[model].items() if key not in typed]
     if larger:
         log.info("batches: about 2^18 samples a step, as suits a GPU (%s)", ", ".join(larger))
     return larger
 
 
-def resolve_correction(
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    finding: str | None = None,
-    former: Mapping[str, Any] | None = None,
-) -> tuple[DictConfig, dict[str, str]]:
-    """Return the config and the names picked from each group, with the correction that the photographs need.
+def resolve_correction(asked: Composed, finding: str | None = None) -> Composed:
+    """Return the config with the correction that the photographs need, unless the user has typed one.
 
-    `finding` is what the doctor says of their exposure; None: nothing. A resumed run (`former`: its config) keeps its
-    own.
+    `finding` is what the doctor says of their exposure; None: nothing. A resumed run keeps its own.
     """
-    picked = chosen(choices)
-    if picked.get("correction") != AUTO:
-        return config, picked
-    if former is None:
+    if asked.choices.get("correction") != AUTO:
+        return asked
+    if asked.former is None:
         cause = finding
     else:
-        section = former.get("correction")
+        section = asked.former.get("correction")
         kept = isinstance(section, dict) and section.get("_target_") == EXPOSURE
         cause = "the run began with it" if kept else None
-    picked["correction"] = "exposure" if cause else "none"
+    name = "exposure" if cause else "none"
     if cause:
         log.info("correction: exposure, since %s (correction=none leaves colors unchanged)", cause)
-        config = copy.deepcopy(config)
-        config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
-    return config, picked
+        exposure = compose_config(asked.command, [*asked.overrides, "correction=exposure"]).config.correction
+        asked = asked.with_setting("correction", exposure)
+    return replace(asked, choices={**asked.choices, "correction": name})
 
 
 def _settle(section: DictConfig, key: str, value: bool) -> None:
-    meant = {AUTO: value, "on": True, "off": False, True: True, False: False, None: False}
+    meant = {AUTO: value, **SWITCH}
     if section.get(key) not in meant:
         raise InputError(f"{key}={section[key]} is not valid: it must be on, off or auto.")
     section[key] = meant[section.get(key)]

@@ -1,32 +1,64 @@
 """Compose a command's config without a command line, such as for a notebook."""
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.hydra_versions import DEFAULTS, search_extensions
 from nerf_lightning.config.instantiate import require_sections
+from nerf_lightning.config.overrides import key_of
 from nerf_lightning.files.folders import conf_folder
 
 
-def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """Return the config that `nerf COMMAND OVERRIDES` would have, and the names picked from each group.
+@dataclass(frozen=True)
+class Composed:
+    """A command's config, with what it was composed from: the program adds what the user leaves open."""
+
+    command: str
+    config: DictConfig
+    choices: Mapping[str, str]
+    """The name picked from each group."""
+    overrides: Sequence[str] = ()
+    former: Mapping[str, Any] | None = None
+    """The config of the run that is resumed, whose choices are kept; untrusted. None: there is none."""
+
+    @property
+    def typed(self) -> set[str]:
+        """The settings that the overrides name."""
+        return set(map(key_of, self.overrides))
+
+    def with_setting(self, key: str, value: object) -> "Composed":
+        """Return this with one value replaced."""
+        config = copy.deepcopy(self.config)
+        OmegaConf.update(config, key, value, merge=False)
+        return replace(self, config=config)
+
+    def composed_with(self, overrides: Sequence[str]) -> "Composed":
+        """Return the config composed anew, with more overrides; they do not count as typed."""
+        anew = compose_config(self.command, [*self.overrides, *overrides])
+        return replace(self, config=anew.config, choices=anew.choices)
+
+
+def compose_config(command: str, overrides: Sequence[str]) -> Composed:
+    """Return the config that `nerf COMMAND OVERRIDES` would have.
 
     Raises:
         InputError: an override cannot be read, or names something that does not exist.
     """
     config = _composed(command, overrides)
-    choices = chosen(config.hydra.runtime.choices)
+    choices = picked(config.hydra.runtime.choices)
     with open_dict(config):
         del config["hydra"]
-    return config, choices
+    return Composed(command, config, choices, overrides)
 
 
 @contextmanager
@@ -52,7 +84,7 @@ def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
     return config
 
 
-def chosen(choices: Mapping[str, Any]) -> dict[str, str]:
+def picked(choices: Mapping[str, Any]) -> dict[str, str]:
     """Return the names picked from each group, without groups from which none was picked."""
     return {key: value for key, value in choices.items() if isinstance(value, str)}
 

@@ -14,7 +14,7 @@ from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.overrides import flatten, quoted
+from nerf_lightning.config.overrides import SWITCH, flatten, quoted
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
@@ -35,9 +35,12 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     Raises:
         InputError: there is no such exporter or setting, or its value makes no sense.
     """
-    asked = {str(name): value for name, value in final.items() if name not in NO_EXPORTERS}
-    wanted = {name: value for name, value in asked.items() if value not in (False, None, "off", "auto")}
-    return {name: _exporter(name, True if value == "on" else value) for name, value in wanted.items()}
+    exporters = {}
+    for name, value in final.items():
+        wanted = value if isinstance(value, DictConfig) else SWITCH.get(value, value)
+        if name not in NO_EXPORTERS and wanted not in (False, "auto"):
+            exporters[str(name)] = _exporter(str(name), wanted)
+    return exporters
 
 
 def build_exporter(config: DictConfig, name: str) -> Any:
@@ -59,7 +62,7 @@ def _exporter(name: str, asked: Any) -> Any:
     overrides = [f"what.{key}={quoted(value)}" for key, value in settings.items()]
     try:
         with in_words("export"):
-            return build_exporter(compose_config("export", [f"what={name}", *overrides])[0], name)
+            return build_exporter(compose_config("export", [f"what={name}", *overrides]).config, name)
     except InputError as error:
         raise InputError(f"final.{name}: {error}") from error
 

@@ -73,7 +73,7 @@ def scene_to_look_at(opened: LoadedModel, scene: DictConfig | None) -> Scene:
     """Give a model that renders from photographs those of a scene (None: of its run), and return the scene."""
     if scene is None:
         path = str(opened.checkpoint.path)
-        scene = compose_config("eval", [f"ckpt={quoted(path)}", *scene_overrides(path)])[0].scene
+        scene = compose_config("eval", [f"ckpt={quoted(path)}", *scene_overrides(path)]).config.scene
     shown = shown_capture(build(scene).read())
     show_photographs(opened.model, shown)
     return shown

@@ -12,6 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.files.folders import option_names
 
 # What Hydra accepts without quotes in any position.
+SWITCH: dict[object, bool] = {"on": True, True: True, "off": False, False: False, None: False}
+"""What the values of a switch mean."""
 PLAIN = re.compile(r"[\w./:@%+-]+", re.ASCII)
 OPEN_SECTIONS = re.compile(rf"(trainer\.lightning|final\.({'|'.join(option_names('what'))}))[.=]")
 """Sections that accept keys which our YAML files do not list: Lightning's arguments, and exporters by name."""

@@ -39,7 +39,7 @@ def read(capture: str | os.PathLike[str] | None = None, *, scene: str = "auto", 
         given["path" if is_archive else "root"] = capture
     overrides = [f"scene={scene}", *(f"scene.{key}={quoted(value)}" for key, value in given.items())]
     with in_words("train"):
-        config, _ = compose_config("train", overrides)
+        config = compose_config("train", overrides).config
         set_limits(Budgets(**config.budgets))
         result: Scene = build(config.scene).read()
     return result

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -185,7 +185,8 @@ def build_run(
     """
     _refuse_settings_of_the_trainer(overrides)
     overrides = of_scene(scene, overrides)
-    config, choices = compose_config("train", overrides)
+    asked = compose_config("train", overrides)
+    config = asked.config
     set_limits(Budgets(**config.budgets))
     settings: TrainerSettings = build(config.trainer)
     former = None if resume is None else read_checkpoint(Path(resume), to_resume=True)
@@ -193,9 +194,10 @@ def build_run(
         settings.keep_precision(former.precision)
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
-    chosen_before = None if former is None else plain_yaml(former.config, str(former.path))
+    if former is not None:
+        asked = replace(asked, former=plain_yaml(former.config, str(former.path)))
     config.budget.seconds = None  # Lightning's Trainer, or `steps`, ends it
-    planned = plan_run(config, choices, overrides, settings, scene, chosen_before, model, loss)
+    planned = plan_run(asked, settings, scene, model, loss)
     guards = planned.config.callbacks
     run = StepwiseRun(**vars(planned), collapse_guard=build(guards.collapse_guard), nan_guard=build(guards.nan_guard))
     settings.prepare(run.system.model)

@@ -85,7 +85,7 @@ class TrainedModel:
         """
         overrides = [f"path={name}", *(f"path.{key}={quoted(value)}" for key, value in settings.items())]
         with in_words("render"):
-            config, _ = compose_config("render", overrides)
+            config = compose_config("render", overrides).config
             subject = Subject(self.module, self.scene, self.scene.background)
             cameras = lay_path(build(config.path), self.scene, partial(content_of, subject, self.tile_points))
             return replace(self.scene, cameras=cameras).user_cameras
@@ -152,7 +152,7 @@ def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
         InputError: the file is not a checkpoint of this package, or is damaged.
     """
     with in_words("render"):
-        config, _ = compose_config("render", [f"ckpt={quoted(run)}", *overrides])
+        config = compose_config("render", [f"ckpt={quoted(run)}", *overrides]).config
         set_limits(Budgets(**config.budgets))
         opened = open_checkpoint(config)
     return TrainedModel(opened.model.eval(), opened.checkpoint, opened.tile_points)

@@ -4,9 +4,7 @@
 """
 
 import logging
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -15,7 +13,7 @@ from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
 from nerf_lightning.checkpoints.same_capture import depth_sums
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest
-from nerf_lightning.config.compose import chosen
+from nerf_lightning.config.compose import Composed
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.decoded_photographs import photograph_hashes
@@ -48,64 +46,46 @@ class Run:
 
 
 def plan_run(
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
+    asked: Composed,
     settings: TrainerSettings,
     scene: Scene | None = None,
-    former: Mapping[str, Any] | None = None,
     model: Model | None = None,
     loss: Loss | None = None,
 ) -> Run:
     """Read the scene, choose what the config leaves open, examine the capture, and build; nothing is written.
 
     Args:
-        config: as composed.
-        choices: the names picked from each group, which checkpoints keep.
-        overrides: those of the config.
+        asked: the config of `nerf train`; checkpoints keep what was picked from each group.
         settings: of the machine.
         scene: replaces the config's.
-        former: the config of the run to resume, whose choices are kept; None: the run is new.
         model: replaces the config's.
         loss: replaces the config's.
 
     Raises:
         InputError: the config or the capture does not allow a run.
     """
-    on_gpu = settings.device_type == "cuda"
-    config, scene = read_scene(config, choices, overrides, on_gpu, scene, former)
-    config, picked = resolve_auto(config, choices, overrides, scene, settings.device_type, former)
-    settings.max_steps = config.trainer.max_steps
-    checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
-    config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
-    data, system = _built(config, picked, settings, scene, model, loss)
-    return Run(config, settings, scene, checks, data, system)
+    asked, scene = read_scene(asked, settings.device_type == "cuda", scene)
+    planned = resolve_auto(asked, scene, settings.device_type)
+    settings.max_steps = planned.config.trainer.max_steps
+    checks = ranks.from_first(lambda: require_sound(scene)) if planned.config.doctor else None
+    planned = resolve_correction(planned, exposure_finding(checks))
+    data, system = _built(planned, settings, scene, model, loss)
+    return Run(planned.config, settings, scene, checks, data, system)
 
 
-def read_scene(
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    on_gpu: bool,
-    scene: Scene | None = None,
-    former: Mapping[str, Any] | None = None,
-) -> tuple[DictConfig, Scene]:
+def read_scene(asked: Composed, on_gpu: bool, scene: Scene | None = None) -> tuple[Composed, Scene]:
     """Return the config with the size of the photographs, and the scene, with distances if the loss needs them."""
-    config = with_longest(config, overrides, on_gpu, former)
-    scene = build(config.scene).read() if scene is None else scene
-    return config, with_distances(scene) if takes_distances(choices, overrides, scene) else scene
+    asked = with_longest(asked, on_gpu)
+    scene = build(asked.config.scene).read() if scene is None else scene
+    return asked, with_distances(scene) if takes_distances(asked, scene) else scene
 
 
 def _built(
-    config: DictConfig,
-    choices: Mapping[str, Any],
-    settings: TrainerSettings,
-    scene: Scene,
-    model: Model | None,
-    loss: Loss | None,
+    planned: Composed, settings: TrainerSettings, scene: Scene, model: Model | None, loss: Loss | None
 ) -> tuple[RayDataModule, RadianceFieldSystem]:
+    config = planned.config
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
-    record = make_record(scene, text, chosen(choices))
+    record = make_record(scene, text, dict(planned.choices))
     record["pixels"] = ranks.from_first(lambda: photograph_hashes(scene.pixels))
     progress = Progress()
     start = None

@@ -94,7 +94,7 @@ class Training:
 
     def __init__(self, method: str, device: torch.device, matmul_precision: MatmulPrecision, tile_points: int | None):
         scene, progress = ball_scene(), Progress()
-        config, _ = compose_config("train", [f"model={method}", f"seed={SEED}", *METHODS[method]])
+        config = compose_config("train", [f"model={method}", f"seed={SEED}", *METHODS[method]]).config
         settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
         self.train_step = build_step(config, settings, scene, progress)
         self.train_step.objective.to(device)

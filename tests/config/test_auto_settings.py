@@ -33,9 +33,13 @@ FORWARD_FACING = replace(IN_A_BOX, space="ndc")
 LARGE_PICTURES = replace(IN_A_BOX, cameras=replace(IN_A_BOX.cameras, focal=IN_A_BOX.cameras.focal * 100.0))
 
 
+def resumed(asked, former):
+    return replace(asked, former=OmegaConf.to_container(former, resolve=True))
+
+
 def chosen_for(scene, *overrides):
-    config, choices = compose_config("train", overrides)
-    return resolve_auto(config, choices, overrides, scene)
+    resolved = resolve_auto(compose_config("train", overrides), scene)
+    return resolved.config, resolved.choices
 
 
 @pytest.mark.parametrize(
@@ -56,21 +60,21 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
 )
 def test_a_gpu_takes_larger_batches_and_for_large_pictures_a_larger_model_and_says_so(caplog, scene, model):
     caplog.set_level("INFO")
-    config, choices = compose_config("train", [])
-    plain = resolve_auto(config, choices, [], scene)[0]
+    asked = compose_config("train", [])
+    plain = resolve_auto(asked, scene).config
     assert "samples a step" not in caplog.text
-    larger, picked = resolve_auto(config, choices, [], scene, "cuda")
-    assert picked["model"] == model
+    resolved = resolve_auto(asked, scene, "cuda")
+    larger = resolved.config
+    assert resolved.choices["model"] == model
     assert larger.data.batch_rays == GPU_BATCHES[model]["data.batch_rays"] == 2 * plain.data.batch_rays
     assert caplog.text.count("about 2^18 samples a step") == 1
     # A run goes on with what was chosen for it, wherever and for however long that was.
-    config.budget.seconds = 5
+    asked = asked.with_setting("budget.seconds", 5)
     for device, former in (("cuda", plain), ("cpu", larger)):
-        again = resolve_auto(config, choices, [], scene, device, OmegaConf.to_container(former, resolve=True))[0]
+        again = resolve_auto(resumed(asked, former), scene, device).config
         assert {**again, "budget": None, "trainer": None} == {**former, "budget": None, "trainer": None}
     typed = ["data.batch_rays=77", "data.sample_budget=5000"]
-    config, choices = compose_config("train", typed)
-    assert resolve_auto(config, choices, typed, scene, "cuda")[0].data.batch_rays == 77
+    assert resolve_auto(compose_config("train", typed), scene, "cuda").config.data.batch_rays == 77
 
 
 def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
@@ -79,7 +83,7 @@ def test_a_run_is_built_for_the_gpu_that_there_is(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
     monkeypatch.setattr(devices, "_trouble_of_gpu", lambda: None)
     overrides = ["scene=bricks", "scene.resolution=16", "encoder.log2_table_size=8"]
-    job = assemble_job(*compose_config("train", overrides), overrides)
+    job = assemble_job(compose_config("train", overrides))
     assert job.settings.device_type == "cuda"
     assert job.data.batches.batch_rays == GPU_BATCHES["fast"]["data.batch_rays"]
 
@@ -243,11 +247,11 @@ def test_photographs_that_are_trained_on_for_long_enough_become_a_page(scene, ty
 )
 def test_photographs_are_as_large_as_the_device_has_time_for(on_gpu, typed, former, longest):
     typed = ("scene=auto", "scene.root=a", *typed)
-    config = with_longest(compose_config("train", typed)[0], typed, on_gpu, former)
-    assert (config.scene.downscale, config.scene.longest) == ("auto", longest)
-    assert fit_model("train", config, {"model": "auto"}, typed, PHOTOGRAPHS, on_gpu)[0].scene.longest == longest
-    built_in = compose_config("train", ())[0]
-    assert with_longest(built_in, (), on_gpu, former) is built_in
+    asked = with_longest(replace(compose_config("train", typed), former=former), on_gpu)
+    assert (asked.config.scene.downscale, asked.config.scene.longest) == ("auto", longest)
+    assert fit_model(replace(asked, former=None), PHOTOGRAPHS, on_gpu).config.scene.longest == longest
+    built_in = replace(compose_config("train", ()), former=former)
+    assert with_longest(built_in, on_gpu) is built_in
 
 
 @pytest.mark.parametrize(
@@ -268,24 +272,23 @@ def test_photographs_are_as_large_as_the_device_has_time_for(on_gpu, typed, form
     ],
 )
 def test_the_length_is_what_is_typed_or_minutes_on_a_cpu_or_the_published_steps(device, typed, seconds, steps):
-    config, choices = compose_config("train", typed)
-    config, _ = resolve_auto(config, choices, typed, IN_A_BOX, device)
+    config = resolve_auto(compose_config("train", typed), IN_A_BOX, device).config
     assert (config.budget.seconds, config.trainer.max_steps) == (seconds, steps)
 
 
 @pytest.mark.parametrize(("began_on", "other"), [("cpu", "cuda"), ("cuda", "cpu")])
 def test_a_run_keeps_its_length_on_another_device(began_on, other):
-    config, choices = compose_config("train", [])
-    former = resolve_auto(config, choices, [], IN_A_BOX, began_on)[0]
-    again = resolve_auto(config, choices, [], IN_A_BOX, other, OmegaConf.to_container(former, resolve=True))[0]
+    asked = compose_config("train", [])
+    former = resolve_auto(asked, IN_A_BOX, began_on).config
+    again = resolve_auto(resumed(asked, former), IN_A_BOX, other).config
     assert (again.budget, again.trainer) == (former.budget, former.trainer)
 
 
 def corrected_for(verdict, *overrides):
-    config, choices = compose_config("train", overrides)
     said = "2 of 20 differ in brightness"
     checks = [Check("sharpness", "look", "blurred"), Check("exposure", verdict, said)] if verdict else None
-    return resolve_correction(config, choices, overrides, exposure_finding(checks))
+    resolved = resolve_correction(compose_config("train", overrides), exposure_finding(checks))
+    return resolved.config, resolved.choices
 
 
 @pytest.mark.parametrize("overrides", [(), ("correction=auto",)])
@@ -320,18 +323,17 @@ def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(
     for named, verdict in (("exposure", None), ("none", "look")):
         chosen = OmegaConf.create({"correction": composed("train", f"correction={named}").correction})
         OmegaConf.save(chosen, tmp_path / ".hydra" / "config.yaml")
-        config, choices = compose_config("train", goes_on.format(tmp_path, tmp_path).split())
+        asked = compose_config("train", goes_on.format(tmp_path, tmp_path).split())
+        asked = replace(asked, former=former_config(asked.config, job_folder=None))
         checks = [Check("exposure", verdict, "one differs")] if verdict else None
-        config, choices = resolve_correction(
-            config, choices, [], exposure_finding(checks), former_config(config, job_folder=None)
-        )
-        assert choices["correction"] == named
-        assert config.correction == chosen.correction
+        resolved = resolve_correction(asked, exposure_finding(checks))
+        assert resolved.choices["correction"] == named
+        assert resolved.config.correction == chosen.correction
 
 
 def test_a_new_run_knows_of_no_former_one_and_what_is_neither_a_switch_nor_auto_is_refused(tmp_path):
     for overrides in ([], [f"paths.output_dir={tmp_path}/new"], ["resume=auto"]):
-        assert former_config(compose_config("train", overrides)[0], job_folder=None) is None
+        assert former_config(compose_config("train", overrides).config, job_folder=None) is None
     with pytest.raises(InputError, match="doctor=maybe is not valid"):
         chosen_for(PHOTOGRAPHS, "doctor=maybe")
 
@@ -342,7 +344,7 @@ def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
     monkeypatch.setattr("nerf_lightning.data.bricks.reader.BricksReader.read", lambda reader: IN_A_BOX)
     for doctor, learnt in (("on", True), ("off", False)):
         overrides = [*FAST, f"doctor={doctor}", "trainer.precision=32-true"]
-        parts = assemble_job(*compose_config("train", overrides), overrides)
+        parts = assemble_job(compose_config("train", overrides))
         assert (parts.system.train_step.objective.correction is not None) == learnt
         assert parts.system.record["choices"]["correction"] == ("exposure" if learnt else "none")
 
@@ -366,10 +368,8 @@ def test_no_more_views_are_evaluated_than_a_budget_has_time_for(typed, device, e
     scene = replace(
         scene, cameras=replace(scene.cameras, **{k: v.expand(len(scene.view_names)) for k, v in size.items()})
     )
-    config, choices = compose_config("train", typed)
-    config, choices = resolve_auto(config, choices, typed, scene, device)
+    config = resolve_auto(compose_config("train", typed), scene, device).config
     assert config.evaluation.max_views == evaluated
-    former = OmegaConf.to_container(config, resolve=True)
     typed = [each for each in typed if "max_views" in each]
-    again = resolve_auto(*compose_config("train", typed), typed, scene, "cpu", former)[0]
+    again = resolve_auto(resumed(compose_config("train", typed), config), scene, "cpu").config
     assert again.evaluation.max_views == evaluated

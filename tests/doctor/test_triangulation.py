@@ -15,7 +15,7 @@ from nerf_lightning.doctor.triangulation import FEWEST, triangulated, with_dista
 @pytest.fixture(scope="module")
 def bricks():
     """Some views from one side."""
-    scene = build(compose_config("train", ["scene=bricks", "scene.resolution=96"])[0].scene).read()
+    scene = build(compose_config("train", ["scene=bricks", "scene.resolution=96"]).config.scene).read()
     apart = (scene.cameras.c2w[:, :, 3] - scene.cameras.c2w[0, :, 3]).norm(dim=-1)
     near, held = apart.argsort()[:10].tolist(), tuple(apart.argsort()[10:12].tolist())
     return replace(scene, splits={"train": tuple(sorted(near)), "val": held, "test": held})
@@ -69,5 +69,5 @@ def test_a_run_has_distances_where_its_loss_takes_them(bricks, space, overrides,
     run = nl.build_run(*overrides, "encoder.max_resolution=64", "encoder.log2_table_size=10", scene=record)
     assert (run.scene.depths is not None) == learns
     asked = compose_config("train", ("scene=in_memory", "scene.name=bricks", *overrides))
-    job = assemble_job(*asked, overrides, scene=record)
+    job = assemble_job(asked, scene=record)
     assert (job.scene.depths is not None) == learns

@@ -32,8 +32,7 @@ class Resumed:
 
     def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
         settings = ("scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25")
-        config, choices = compose_config("train", settings)
-        parts = assemble_job(config, choices, ())
+        parts = assemble_job(compose_config("train", settings))
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"

@@ -1,7 +1,6 @@
 """What `nerf train` adds to a run: callbacks, loggers, the doctor, and what follows the training."""
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import AUTO
+from nerf_lightning.config.compose import Composed, picked
 from nerf_lightning.config.exporters import exporters_after_training
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import quoted
@@ -45,44 +45,34 @@ class TrainJob(Run):
     post_training: PostTraining
 
 
-def build_job(asked: DictConfig, scene: Scene | None = None) -> TrainJob:
+def build_job(config: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
-    former = ranks.from_first(lambda: former_config(asked, job_folder()))
-    overrides = typed_overrides()
-    if job_folder() is not None and asked.final.get("page") == AUTO:
-        asked = copy.deepcopy(asked)
-        asked.final.page = False  # the runs of a sweep are compared, not handed over
-        overrides.append("final.page=false")
-    job = assemble_job(asked, HydraConfig.get().runtime.choices, overrides, former, scene)
+    asked = composed("train", config, ranks.from_first(lambda: former_config(config, job_folder())))
+    if job_folder() is not None and config.final.get("page") == AUTO:
+        asked = asked.with_setting("final.page", False)  # the runs of a sweep are compared, not handed over
+    job = assemble_job(asked, scene)
     if job_folder() is not None:
         job.signals.stop_file = stop_file(Path(HydraConfig.get().sweep.dir))
     return job
 
 
-def assemble_job(
-    asked: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    former: Mapping[str, Any] | None = None,
-    scene: Scene | None = None,
-) -> TrainJob:
+def assemble_job(asked: Composed, scene: Scene | None = None) -> TrainJob:
     """Build all parts of a `nerf train` run and read its scene; nothing is written.
 
-    What the config leaves open is chosen for the scene; checkpoints keep the choices. `former` is the config of the
-    resumed run, as its folder keeps it; None: a new run.
+    What the config leaves open is chosen for the scene; checkpoints keep the choices.
 
     Raises:
         InputError: the config or the capture does not allow a run.
     """
-    settings: TrainerSettings = build(asked.trainer)
+    settings: TrainerSettings = build(asked.config.trainer)
     if settings.launched_by == "nerf":
         require_one_task()
     settings.prepare_machine()
-    post_training, loggers = PostTraining.from_config(asked), build(asked.logger)
+    post_training, loggers = PostTraining.from_config(asked.config), build(asked.config.logger)
     for each in loggers.values() if ranks.is_first() else ():
         if isinstance(each, WeightsAndBiases):
             each.require_access()
-    run = plan_run(asked, choices, overrides, settings, scene, former)
+    run = plan_run(asked, settings, scene)
     config = run.config
     post_training.exports = exporters_after_training(config.final)  # of what was left open, too
     post_training.require_film(run.scene)
@@ -104,9 +94,11 @@ def assemble_job(
     )
 
 
-def typed_overrides() -> list[str]:
-    """Return the overrides of this command's config, to compose again what is left open."""
-    return [*searchpath_override(), *HydraConfig.get().overrides.task]
+def composed(command: str, config: DictConfig, former: Mapping[str, Any] | None = None) -> Composed:
+    """Return the config of this command with its overrides, to compose again what is left open."""
+    hydra = HydraConfig.get()
+    overrides = [*searchpath_override(), *hydra.overrides.task]
+    return Composed(command, config, picked(hydra.runtime.choices), overrides, former)
 
 
 def searchpath_override() -> list[str]:

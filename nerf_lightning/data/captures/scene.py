@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import FARTHEST
-from nerf_lightning.data.captures.extent import choose_space, extent_of, given_extent, require_possible
+from nerf_lightning.data.captures.frame_and_extent import choose_space, extent_of, given_extent, require_possible
 from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.nerf.geometry.world_frame import points_from_user, poses_from_user, unit_of

@@ -47,12 +47,13 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
     # What a run does only at its start, showing the pictures' centers first, is for untrained weights.
     length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
     former = open_sections([*former_overrides(folder, length), *length])
-    config, choices = compose_config("train", former)
-    if choices.get("model") == AUTO:  # the choices for the scene
+    begun = compose_config("train", former)
+    config = begun.config
+    if begun.choices.get("model") == AUTO:  # the choices for the scene
         picked = {group: checkpoint.choices.get(group) for group in ("model", "loss")}
         former += [f"{group}={name}" for group, name in picked.items() if name in option_names(group)]
         former += settled(plain_yaml(checkpoint.config, f"The config in {checkpoint.path}"))
-        config, _ = compose_config("train", former)
+        config = compose_config("train", former).config
     model = OmegaConf.to_container(config.model, resolve=False)
     return [*former, *dict.fromkeys(f"{_setting(model, name)}={width}" for name, width in widths.items())]
 

@@ -25,7 +25,7 @@ class HiddenLayer:
 
 
 class Field(Part, ABC):
-    """A radiance field: density and color at points (`types.points`)."""
+    """A radiance field: density and color at points (`types.rays`)."""
 
     sees_cones: bool = False
     """True if the result depends on the pixels' cones (`Points.covariance`)."""

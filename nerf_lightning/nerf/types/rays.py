@@ -86,7 +86,7 @@ class RaggedSamples(TensorStruct):
 
     The arrays have a capacity; beyond the last bound is padding of zero length, spread over the rays, since a GPU
     accumulates the gradients of one ray serially. The layout is ragged for speed, and has its own functions
-    (`rendering.ragged`).
+    (`rendering.quadrature`).
     """
 
     ray_index: Int[Tensor, "capacity"]

@@ -67,7 +67,7 @@ def test_what_lightning_would_not_take_is_refused(flags, parts):
 def test_no_plus_is_needed_and_no_other_run_is_meant():
     """Whatever passes through changes what is shown and measured, but not what is learned."""
     typed = open_sections(["trainer.lightning.profiler=simple", "seed=3", "+trainer.lightning.limit_val_batches=2"])
-    config, _ = compose_config("train", typed)
+    config = compose_config("train", typed).config
     assert dict(config.trainer.lightning) == {"profiler": "simple", "limit_val_batches": 2}
     assert config.seed == 3
     without = composed("train", "seed=3")

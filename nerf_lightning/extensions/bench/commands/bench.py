@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import DictConfig
 from rich.progress import track
 from rich.table import Table
 
-from nerf_lightning.commands.train_job.build import typed_overrides
+from nerf_lightning.commands.train_job.build import composed
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import peak_memory, seconds_of, torch_threads
 from nerf_lightning.config.auto_settings import fit_model
@@ -78,10 +77,9 @@ def run(config: DictConfig) -> float:
 
 def _settled(config: DictConfig) -> tuple[DictConfig, Scene]:
     """Return the config with the choices for its scene, and the scene."""
-    choices, overrides = HydraConfig.get().runtime.choices, typed_overrides()
     on_gpu = build(config.trainer).device_type == "cuda"
-    config, scene = read_scene(config, choices, overrides, on_gpu)
-    return fit_model("bench", config, choices, overrides, scene, on_gpu)[0], scene
+    asked, scene = read_scene(composed("bench", config), on_gpu)
+    return fit_model(asked, scene, on_gpu).config, scene
 
 
 def _interleaved(kinds: Mapping[str, Work], rounds: int) -> Rows:

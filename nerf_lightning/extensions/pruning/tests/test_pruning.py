@@ -129,7 +129,8 @@ def test_fine_tuning_repeats_what_was_chosen_for_the_scene(stopped_fast, tmp_pat
         choices={"model": "fast_proposal", "loss": "depth"},
         config="{encoder: {max_resolution: 77, log2_table_size: 9}, data: {batch_rays: not a number}}",
     )
-    config, choices = compose_config("train", fine_tuning(checkpoint, {"levels.fine.field": 8}, 2))
+    asked = compose_config("train", fine_tuning(checkpoint, {"levels.fine.field": 8}, 2))
+    config, choices = asked.config, asked.choices
     assert (choices["model"], choices["loss"], config.seed) == ("fast_proposal", "depth", 3)
     assert (config.encoder.max_resolution, config.encoder.log2_table_size, config.field.width) == (77, 9, 8)
 

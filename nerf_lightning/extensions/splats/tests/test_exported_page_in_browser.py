@@ -169,7 +169,7 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
         run("document.getElementById('save').click()")
         file = tmp_path / "camera_path.yaml"
         wait_until_there(file)
-        config = compose_config("render", ["ckpt=RUN", "path=keyframes", f"path.file={file}"])[0]
+        config = compose_config("render", ["ckpt=RUN", "path=keyframes", f"path.file={file}"]).config
         path = build(config.path)
         assert len(lay_path(path, record).c2w) == 121
         for second in (1.5, 4.0):
