@@ -1,9 +1,10 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
+const MIDDLE = matchMedia("(pointer: coarse)").matches ? "" : ", or press Enter for the middle";
 const ASKS = {
-  note: "Tap the place that the note is about, or press Enter for the middle.",
-  distance: "Tap the first point, or press Enter for the middle.",
-  second: "Tap the second point.",
+  note: `Tap the place that the note is about${MIDDLE}.`,
+  distance: `Tap the first point${MIDDLE}.`,
+  second: `Tap the second point${MIDDLE}.`,
 };
 
 class Marks {

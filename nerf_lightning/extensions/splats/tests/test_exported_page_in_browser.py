@@ -81,6 +81,10 @@ def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
             press(driver, "arrowleft")
             assert driver.execute_script(edges)[2] == places
             driver.execute_script("dispatchEvent(new KeyboardEvent('keyup', {key: 'arrowleft'}))")
+            # Fingers or keys: what there is.
+            press(driver, "i")
+            controls = driver.find_element("css selector", "#numbers").text
+            assert ("two fingers" in controls, "Shift and drag" in controls) == (size == "phone", size != "phone")
             assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
             before = "document.getElementById('full').getBoundingClientRect()"
             left = driver.execute_script(f"return {before}.left")
