@@ -26,6 +26,7 @@ class ViewOnPage:
     render: Embedded
     depth: Embedded
     error: Embedded
+    true_depth: Embedded | None = None
 
 
 @dataclass
