@@ -61,8 +61,9 @@ def inline_math(page, node):
 
 
 def display_math(page, node):
-    """Write a formula on a line of its own."""
-    page.body.append(f'<div class="math">{mathml(node.astext(), "block")}</div>')
+    """Write a formula on a line of its own, or on several where its equations do not fit next to each other."""
+    equations = re.split(r"\\q?quad\b", node.astext())
+    page.body.append(f'<div class="math">{"".join(mathml(equation, "block") for equation in equations)}</div>')
     raise nodes.SkipNode
 
 

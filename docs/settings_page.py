@@ -35,7 +35,7 @@ def _of_group(command: Command, group: str) -> Iterator[str]:
         if default is not None:
             yield from (f"Default: `{default.typed}`.", "")
         yield from ("| option | description |", "|---|---|")
-        yield from (f"| `{option.typed}` | {_cell(brief(option.about))} |" for option in options)
+        yield from (f"| `{option.typed}` | {_prose(brief(option.about))} |" for option in options)
         yield ""
     yield from _table(each for option in options for each in option.settings)
 
@@ -47,8 +47,13 @@ def _table(settings: Iterable[Setting]) -> Iterator[str]:
     yield from ("| setting | description | type |", "|---|---|---|")
     for each in rows.values():
         takes = f"`{_cell(each.takes)}`" if each.takes else ""
-        yield f"| `{each.key}={_cell(each.text)}` | {_cell(each.meaning)} | {takes} |"
+        yield f"| `{each.key}={_cell(each.text)}` | {_prose(each.meaning)} | {takes} |"
     yield ""
+
+
+def _prose(text: str) -> str:
+    """Return a text whose dollars are no formulas."""
+    return _cell(text).replace("$", "\\$")
 
 
 def _cell(text: str) -> str:

@@ -13,6 +13,7 @@ import pytest
 import torch
 import yaml
 from lightning import Trainer
+from support.browser import layout_faults, opened
 from support.captures import write_blender, write_npz
 from support.running import FAST, REPOSITORY, start_code
 
@@ -249,18 +250,44 @@ def test_files_of_the_table_of_tasks_are_there():
     assert [name for name in named if not (ROOT / "nerf_lightning" / name).exists()] == []
 
 
-@pytest.mark.minutes
-def test_the_site_is_built_without_a_warning(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site."""
     for needed in ("furo", "myst_nb", "sphinx_copybutton", "latex2mathml"):
         pytest.importorskip(needed)
-    build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
+    folder = tmp_path_factory.mktemp("site")
+    build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(folder)]
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    method = (tmp_path / "method.html").read_text(encoding="utf-8")
+    return folder
+
+
+@pytest.mark.minutes
+def test_the_site_is_built_without_a_warning(site):
+    method = (site / "method.html").read_text(encoding="utf-8")
     assert method.count("<math ") > 10
     assert not re.findall(r'(?:src|<link[^>]* href)="https?://[^"]*', method), "nothing is loaded from elsewhere"
-    assert "data.sample_budget" in (tmp_path / "settings.html").read_text(encoding="utf-8")
-    assert "nerf_lightning.TrainedModel" in (tmp_path / "api.html").read_text(encoding="utf-8")
+    settings = (site / "settings.html").read_text(encoding="utf-8")
+    assert "data.sample_budget" in settings
+    assert "<math" not in settings, "a dollar in a sentence is no formula"
+    assert "nerf_lightning.TrainedModel" in (site / "api.html").read_text(encoding="utf-8")
+
+
+FORMULAS = """
+const boxes = [...document.querySelectorAll("div.math")], faults = boxes.length ? [] : ["there are no formulas"];
+if (document.documentElement.scrollWidth > innerWidth) faults.push("the page scrolls sideways");
+const wide = box => box.scrollWidth > box.clientWidth && box.children.length > 1;
+const cut = box => box.scrollHeight > box.clientHeight;
+return [...faults, ...boxes.filter(box => wide(box) || cut(box)).map(box => box.textContent)];
+"""
+
+
+@pytest.mark.minutes
+@pytest.mark.parametrize("page", ["method", "course_2_rays"])
+def test_formulas_wrap_or_scroll_in_their_own_boxes_on_phones(site, page):
+    with opened((site / f"{page}.html").as_uri()) as driver:
+        layout_faults(driver, "phone")
+        assert driver.execute_script(FORMULAS) == []
 
 
 SMALLER = (

@@ -59,6 +59,8 @@ def export(config: DictConfig) -> list[Path]:
     crop = crop_corners(OmegaConf.to_container(config.crop) if OmegaConf.is_config(config.crop) else config.crop)
     if crop is not None and not what.crops:
         raise InputError("crop: this exporter writes the whole scene. Use what=page, splats, points or mesh.")
+    if not isinstance(config.min_opacity, int | float) or not 0 <= config.min_opacity < 1:
+        raise InputError(f"min_opacity={config.min_opacity}: give a share of the light, from 0 to below 1.")
     # In float32, whatever the training precision: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
     if what.needs_density:
@@ -66,7 +68,7 @@ def export(config: DictConfig) -> list[Path]:
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with filled_folder(config.paths.output_dir, default) as folder:
-        written = write_files(what, opened, photographs, path, folder, crop)
+        written = write_files(what, opened, photographs, path, folder, crop, config.min_opacity)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are the refined ones (refinement=...), not those that were read")
     say_written(*written)
@@ -80,11 +82,13 @@ def write_files(
     path: CameraPath | None,
     folder: Path,
     crop: tuple[Corner, Corner] | None = None,
+    min_opacity: float = RunContext.min_opacity,
 ) -> list[Path]:
     """Export an opened model, or the part of it between the corners of `crop`, into an existing folder."""
     record = opened.checkpoint.scene
     content = partial(content_of, Subject(opened.model, record, record.background), opened.tile_points)
     run = run_context(opened, photographs, path if what.plays_path else None, content)
+    run = replace(run, min_opacity=min_opacity)
     if crop is not None:
         run = replace(run, crop=CropBox.from_user(*crop, record.to_user))
     if opened.model.needs_photographs:

@@ -45,6 +45,6 @@ def train(config: DictConfig, scene: Scene | None = None) -> Trained:
         trainer = fit(job, folder)
         folder.trained(job.clock.seconds)
         psnr = job.post_training(job.settings, job.scene, job.system.model, trainer, folder.path)
-        show(job, folder.path, trainer, psnr)
+        show(job, folder, trainer, psnr)
         folder.note(finished_at_step=trainer.global_step, budget_seconds=job.config.budget.seconds, psnr=psnr)
     return Trained(folder.path, psnr)

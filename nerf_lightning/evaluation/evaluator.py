@@ -28,6 +28,10 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.rendering.background import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
+from nerf_lightning.visualization.pictures import visible_range
+
+# Number of views that the range of the depth's colors is taken from, and the maximum length of their longer side.
+PROBES, PROBE_PIXELS = 8, 32
 
 log = logging.getLogger(__name__)
 
@@ -96,6 +100,7 @@ class Scoring:
         rays_of = RayGenerator.of_views(scene, model.needs_photographs)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
+        depth_range = _depth_range(model, scene, rays_of, views, background, tile_points)
         with closing(KeptViews(folder, self.split, self.num_worst)) as kept:
             for view in tracked(mine, f"evaluating {self.split}"):
                 if scene.refined and view not in scene.splits["train"]:
@@ -104,7 +109,7 @@ class Scoring:
                 started = time.perf_counter()
                 picture = render_picture(model, rays_of, view, background, tile_points)
                 seconds = time.perf_counter() - started
-                row, shown = self._compare(picture, scene, view, background)
+                row, shown = self._compare(picture, scene, view, background, depth_range)
                 if model.needs_photographs:
                     row["unseen"] = float((picture.opacity == 0).float().mean())
                 rows.append(row | {"seconds": seconds})
@@ -140,7 +145,7 @@ class Scoring:
         return evenly_spaced_subset(views, self.max_views if isinstance(self.max_views, int) else len(views))
 
     def _compare(
-        self, picture: Picture, scene: Scene, view: int, background: Background
+        self, picture: Picture, scene: Scene, view: int, background: Background, depth_range: tuple[float, float]
     ) -> tuple[dict[str, Any], ScoredView]:
         truth, kept = photograph(scene, view, background), scene.pixels.kept(view)
         scored = slice(None)
@@ -155,8 +160,20 @@ class Scoring:
         render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
         row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(render, true, counts)}
         row["lpips"] = None if self._lpips is None else self._lpips.score(masked_out(render, true, counts), true)
-        depth = told_length(scene)[0] * picture.depth
-        return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
+        unit, known = told_length(scene)[0], scene.truth
+        true_depth = None if known is None else unit * known(view).depth.view(picture.depth.shape)
+        shown = unit * picture.depth, picture.opacity, depth_range, true_depth
+        return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, *shown)
+
+
+def _depth_range(
+    model: Model, scene: Scene, rays_of: RayGenerator, views: list[int], background: Background, tile_points: int
+) -> tuple[float, float]:
+    """Return near and far of what a few small views show, in meters or the user's units."""
+    small, few = rays_of.at_most(PROBE_PIXELS), evenly_spaced_subset(views, PROBES)
+    pictures = [render_picture(model, small, view, background, tile_points) for view in few]
+    depth, opacity = (torch.cat([getattr(each, name).flatten() for each in pictures]) for name in ("depth", "opacity"))
+    return visible_range(told_length(scene)[0] * depth[None], opacity[None])
 
 
 def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:

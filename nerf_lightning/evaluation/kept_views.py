@@ -16,7 +16,8 @@ from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import child_of, file_name, make_folder
 from nerf_lightning.visualization.pictures import mosaic, panels, save_png
 
-PARTS = ("truth", "render", "depth", "error")
+PARTS = ("truth", "render", "depth", "true_depth", "error")
+"""What is kept of a view; the true depth only where it is known."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,14 @@ class ScoredView:
     depth: Float[Tensor, "height width"]
     """Distance along the ray, in the user's units."""
     opacity: Float[Tensor, "height width"]
+    depth_range: tuple[float, float]
+    """Near and far of the colors of depth, the same for all views."""
+    true_depth: Float[Tensor, "height width"] | None = None
+    """As `depth`; inf where there is nothing."""
 
     def parts(self) -> Iterator[tuple[str, UInt8[Tensor, "_ _ 3"]]]:
         """Yield the view's pictures with their names, one by one."""
-        return panels(self.truth, self.render, self.depth, self.opacity)
+        return panels(self.truth, self.render, self.depth, self.opacity, self.depth_range, self.true_depth)
 
 
 @dataclass
@@ -44,6 +49,8 @@ class KeptViews:
     worst: list[tuple[float, str, IO[bytes]]] = field(default_factory=list)
     """The views of lowest PSNR so far, with name and pictures; no others are held, since a split may be larger than the
     disk, and these are in unnamed files, since they may exceed memory."""
+    parts: dict[str, None] = field(default_factory=dict)
+    """Names of the pictures in these files, in their order."""
 
     def save(self, name: str, view: ScoredView) -> None:
         """Write the pictures of an evenly spaced view."""
@@ -54,7 +61,8 @@ class KeptViews:
         if sum((held[:2] < (psnr, name)) for held in self.worst) >= self.num_worst:
             return
         file = TemporaryFile(dir=make_folder(self.folder))  # noqa: SIM115 (closed where the view is dropped or written)
-        for _, picture in view.parts():
+        for part, picture in view.parts():
+            self.parts |= {part: None}
             content = io.BytesIO()  # numpy does not report a disk too full for the last bytes
             np.save(content, picture.numpy())
             with full_disk_named(self.folder):
@@ -70,7 +78,7 @@ class KeptViews:
         for _, name, file in self.worst:
             file.seek(0)
             if name in names:
-                parts = ((part, torch.from_numpy(np.load(file))) for part in PARTS)
+                parts = ((part, torch.from_numpy(np.load(file))) for part in self.parts)
                 self._write(f"worst_{names.index(name) + 1}", parts)
         return names
 

@@ -38,6 +38,8 @@ class RunContext:
     """Display name of the scene; empty: that of its record."""
     crop: CropBox | None = None
     """The part of the scene to export; None: all of it."""
+    min_opacity: float = 0.5
+    """Minimum opacity of a pixel that sees a surface; behind fainter matter, which is left out, there is nothing."""
 
 
 MODEL_ALONE = RunContext()

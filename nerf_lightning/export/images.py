@@ -28,7 +28,6 @@ from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]
 Split = Literal["train", "val", "test", "all"]
-OPAQUE = 0.5  # Pixels with lower opacity have no depth.
 LARGEST = 65_535
 KINDS = ("depth", "opacity", "normals")
 MILLIMETRE = 1e-3
@@ -72,7 +71,7 @@ class ImagesExport(Export):
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):
                 seen = see(model, record, record.cameras, view, tile_points)
-                depth = self._depth(seen, record, view)
+                depth = self._depth(seen, record, view, run.min_opacity)
                 _save_array(child_of(depths, names[view], ending=".npy"), depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
                 save_png(child_of(opacities, names[view], ending=".png"), to_bytes(seen.opacity))
@@ -102,11 +101,13 @@ class ImagesExport(Export):
             raise InputError(f"{record.name} has no {self.split} views. Choose another split with what.split=...")
         return evenly_spaced_subset(views, self.max_views or len(views))
 
-    def _depth(self, seen: SeenView, record: SceneRecord, view: int) -> Float[ndarray, "height width"]:
+    def _depth(
+        self, seen: SeenView, record: SceneRecord, view: int, min_opacity: float
+    ) -> Float[ndarray, "height width"]:
         depth = seen.depth
         if self.depth == "z":
             depth = -camera_coordinates(record.cameras, view, seen.points)[..., 2]
-        opaque = (seen.opacity > OPAQUE) & depth.isfinite()
+        opaque = seen.surface_depth(min_opacity).isfinite()
         return torch.where(opaque, told_length(record)[0] * depth.double(), torch.nan).float().numpy()
 
     def _described(self, record: SceneRecord, names: dict[int, str], scale: float) -> dict[str, Any]:

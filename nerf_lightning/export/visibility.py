@@ -35,6 +35,10 @@ class SeenView:
     channels: dict[str, Float[Tensor, "height width _"]]
     """Other outputs of the model's field, by name."""
 
+    def surface_depth(self, min_opacity: float) -> Float[Tensor, "height width"]:
+        """Return the depth of what is opaque; inf where nothing is."""
+        return torch.where((self.opacity > min_opacity) & self.depth.isfinite(), self.depth, torch.inf)
+
 
 def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
     """Refuse views whose rays need more memory than is available, before the first one is rendered."""

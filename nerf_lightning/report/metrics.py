@@ -101,7 +101,8 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
 
 
 def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
-    parts = {part: embedded_file(folder / f"{part}.png") for part in PARTS}
+    files = {part: folder / f"{part}.png" for part in PARTS}
+    parts = {part: embedded_file(file) for part, file in files.items() if part != "true_depth" or file.is_file()}
     known = {metric: _shown(metric, row.get(metric)) for metric in ("psnr", "ssim")}
     numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)

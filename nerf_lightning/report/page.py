@@ -78,6 +78,7 @@ class ViewOnPage:
     render: Embedded
     depth: Embedded
     error: Embedded
+    true_depth: Embedded | None = None
 
 
 @dataclass

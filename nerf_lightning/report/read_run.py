@@ -27,6 +27,7 @@ MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
 """Labels of the numbers that are not folded."""
 SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
+LONGEST_RESULT = 2000
 VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
 EARLIER = "of an earlier checkpoint"
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
@@ -120,6 +121,7 @@ def _is_older(file: Path, run: Path) -> bool:
 def _add_measured(report: Report, run: Path, file: Path) -> None:
     metrics, note = read_json_object(file), read_note(run)
     report.subtitle = f"{run.absolute()}, started {str(note.get('started', 'at an unknown time')).replace('T', ' ')}"
+    report.result = str(note.get("result", ""))[:LONGEST_RESULT]
     known = facts(metrics, note)
     report.facts = [pair for pair in known if pair[0] in MAIN]
     report.more_facts = [pair for pair in known if pair[0] not in MAIN]

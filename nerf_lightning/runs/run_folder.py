@@ -92,7 +92,10 @@ class RunFolder:
         self.note(**{key: round((number(note.get(key)) or 0.0) + value, 1) for key, value in spent.items()})
 
     def note(self, **values: Any) -> None:
-        """Add values to `run.json`: `num_steps`, the planned length; `finished_at_step`, once the run is complete.
+        """Add values to `run.json`.
+
+        `num_steps` is the planned length, `result` a sentence for the report, `finished_at_step` stands there once the
+        run is complete.
 
         Raises:
             InputError: the folder is gone.

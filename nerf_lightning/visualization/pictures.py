@@ -113,7 +113,7 @@ def depth_picture(
     for rows in row_chunks(*depth.shape):
         colors = color_map(depth[rows], low=far, high=near)
         picture[rows] = to_bytes(colors if opacity is None else faded(colors, opacity[rows]))
-    return _with_scale(picture, top=near, bottom=far)
+    return _with_scale(picture, top=f"near {near:.3g}", bottom=f"far {far:.3g}")
 
 
 def faded(
@@ -132,7 +132,7 @@ def error_picture(
     for rows in row_chunks(*truth.shape[:2]):
         error = (truth[rows].detach().float().cpu() - render[rows].detach().float().cpu()).abs().mean(dim=-1)
         picture[rows] = to_bytes(color_map(error, 0.0, ERROR_SCALE))
-    return _with_scale(picture, top=ERROR_SCALE, bottom=0.0)
+    return _with_scale(picture, top=f"{ERROR_SCALE:.3g}", bottom="0")
 
 
 def panels(
@@ -140,11 +140,20 @@ def panels(
     render: Float[Tensor, "height width 3"],
     depth: Float[Tensor, "height width"],
     opacity: Float[Tensor, "height width"],
+    depth_range: tuple[float, float] | None = None,
+    true_depth: Float[Tensor, "height width"] | None = None,
 ) -> Iterator[tuple[str, UInt8[Tensor, "height wider 3"]]]:
-    """Yield truth, render, depth and error with their names, one after another: a large one takes much memory."""
+    """Yield truth, render, depth, true depth if it is known, and error, with their names.
+
+    They come one after another: a large one takes much memory. `depth_range` is near and far of the colors of both
+    depths; None: what is visible here.
+    """
+    near, far = depth_range or visible_range(depth, opacity)
     yield "truth", to_bytes(truth)
     yield "render", to_bytes(render)
-    yield "depth", depth_picture(depth, *visible_range(depth, opacity), opacity)
+    yield "depth", depth_picture(depth, near, far, opacity)
+    if true_depth is not None:
+        yield "true_depth", depth_picture(true_depth, near, far, true_depth.isfinite().float())
     yield "error", error_picture(truth, render)
 
 
@@ -194,18 +203,17 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
     return torch.from_numpy(np.array(page))
 
 
-def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
-    """Add a slim color bar on the picture's right, from bright at `top` down to dark, with both numbers."""
+def _with_scale(picture: UInt8[Tensor, "height width 3"], top: str, bottom: str) -> UInt8[Tensor, "height wider 3"]:
+    """Add a slim color bar on the picture's right, from bright at `top` down to dark, with both texts."""
     height = picture.shape[0]
     size = letter_size(height)
     font = ImageFont.load_default(size)
-    texts = (f"{top:.3g}", f"{bottom:.3g}")
     thick, space = max(4, size // 2), max(3, size // 3)
-    longest = max(round(font.getlength(text) + 0.5) for text in texts)
+    longest = max(round(font.getlength(text) + 0.5) for text in (top, bottom))
     page = Image.new("RGB", (3 * space + thick + longest, height), (PAPER,) * 3)
     ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
     page.paste(Image.fromarray(to_bytes(ramp).numpy()), (space, 0))
     draw, left = ImageDraw.Draw(page), 2 * space + thick
-    draw.text((left, 0), texts[0], fill=_INK, font=font, anchor="lt")
-    draw.text((left, height), texts[1], fill=_INK, font=font, anchor="ls")
+    draw.text((left, 0), top, fill=_INK, font=font, anchor="lt")
+    draw.text((left, height), bottom, fill=_INK, font=font, anchor="ls")
     return torch.cat([picture, torch.from_numpy(np.array(page))], dim=1)

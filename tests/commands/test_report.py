@@ -1,5 +1,6 @@
 """`nerf report`: what the page holds, that it works in a browser, and that a stranger's run stays harmless in it."""
 
+import html
 import json
 import re
 import shutil
@@ -32,6 +33,9 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert f"report       {path}" in output
     assert "left out" not in output
     metrics = json.loads((finished_run / "metrics.json").read_text())
+    result = json.loads((finished_run / "run.json").read_text())["result"]
+    assert re.search(r"dB on held-out photographs, .+ To improve it, .+\.", result)
+    assert html.unescape(re.search(r'<p id="result">(.+)</p>', text)[1]) == result
     stamps = metrics["protocol"]["split_hash"], metrics["origin"]["checkpoint"], metrics["environment"]["torch"]
     for shown in (f"{metrics['psnr']:.2f} dB", *stamps, "trainer.max_steps=20", "near and far"):
         assert shown in text, shown
@@ -140,6 +144,7 @@ def evil_run(tmp_path):
         protocol={EVIL: EVIL, "scene": EVIL},
         origin={"model": EVIL, EVIL: [EVIL]},
         started=EVIL,
+        result=EVIL,
     )
     metrics = json.loads((run / "metrics.json").read_text())
     metrics |= {"per_image": [{"name": EVIL, "psnr": 20.0}], "worst_views": [EVIL], "pictures": ["../../secret", EVIL]}

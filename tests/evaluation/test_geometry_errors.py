@@ -1,13 +1,19 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from support.known_fields import ball, solid
+from support.scenes import ball_scene
 from torch.nn.functional import normalize
 
+from nerf_lightning.data.pixels.picture_files import read_rgba
+from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.types.scene import Truth
 
 FAR = 6.0
 
@@ -133,3 +139,19 @@ def test_only_pixels_whose_neighbours_are_covered_count():
     truth[2, 2] = 0.0
     assert normal_error(normals, truth, alpha) == pytest.approx(90.0 * 2 / 3)
     assert normal_error(normals, truth, torch.zeros(5, 5)) is None
+
+
+def test_true_and_rendered_depths_of_all_views_are_shown_on_one_scale(tmp_path):
+    scene = ball_scene(num_views=6, size=24)
+    c2w = scene.cameras.c2w.clone()
+    c2w[2, :, 3] *= 1.2  # farther
+    scene = replace(scene, cameras=replace(scene.cameras, c2w=c2w), far=1.2 * scene.far)
+    depth = torch.full((24 * 24,), 2.0)
+    scene = replace(scene, truth=lambda view: Truth(depth, torch.zeros(24 * 24, 3)))
+    Scoring(split="train", num_worst=1).score(solid(ball()), scene, "white", 1 << 15, tmp_path)
+    views = sorted((tmp_path / "images" / "views").iterdir())
+    pictures = [read_rgba(view / f"{name}.png")[..., :3] for view in views for name in ("depth", "true_depth")]
+    assert len(pictures) > 4
+    legends = {picture[:, 24:].tobytes() for picture in pictures}
+    assert len(legends) == 1
+    assert len({picture[:, :24].tobytes() for picture in pictures[::2]}) > 1

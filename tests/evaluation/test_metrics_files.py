@@ -51,7 +51,7 @@ def test_a_view_that_is_background_alone_keeps_the_runs_numbers(tmp_path):
 
 def view(shade):
     picture = torch.full((12, 12, 3), shade)
-    return ScoredView(picture, picture, torch.ones(12, 12), torch.ones(12, 12))
+    return ScoredView(picture, picture, torch.ones(12, 12), torch.ones(12, 12), (0.5, 2.0))
 
 
 def test_the_worst_of_all_processes_are_kept_in_order(tmp_path):

@@ -119,7 +119,7 @@ PATH = ("path=orbit", "path.num_frames=2", "path.width=32", "format=frames")
         ("render", *PATH, "outputs=[rgb,depth,opacity,normals]"),
         ("export", "what=cameras"),
         ("export", "what=images"),
-        ("export", "what=points", "what.num_points=1000", "what.min_opacity=0.3", "what.agreement=0"),
+        ("export", "what=points", "what.num_points=1000", "min_opacity=0.3", "what.agreement=0"),
         ("export", "what=volume", "what.resolution=16"),
     ],
 )

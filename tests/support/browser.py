@@ -152,6 +152,7 @@ def layout_faults(driver, size: str, prepare: str = "") -> list[str]:
     width, height = SIZES[size]
     window = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": size == "phone"}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", window)
+    driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": size == "phone"})
     driver.refresh()
     time.sleep(0.5)
     driver.execute_script(prepare)

@@ -34,6 +34,12 @@ def press(driver, key: str) -> None:
     driver.execute_script(f"document.body.dispatchEvent({event})", key)
 
 
+def hide_controls(driver) -> None:
+    """Let the scene have the whole window."""
+    press(driver, "h")
+    wait_for(driver, "still")
+
+
 def drawn(page, view: int, width: int, height: int, behind=1.0) -> np.ndarray:
     """What the file shows through a camera in a window, its picture in the middle."""
     lens = read_page(page)[0]["cameras"][view]

@@ -17,6 +17,7 @@ from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.commands.train_job.fit import resume_command, trust_setting
+from nerf_lightning.commands.train_job.held_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import CPU_SECONDS
 from nerf_lightning.config.instantiate import build
@@ -47,12 +48,14 @@ MEMORIZED = 6.0  # dB between training and held-out views, beyond which only mor
 log = logging.getLogger(__name__)
 
 
-def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> None:
-    """Close the loggers, and write what the config specifies."""
+def show(job: TrainJob, held: HeldFolder, trainer: Trainer, psnr: float | None) -> None:
+    """Close the loggers, note the result in a sentence, and write what the config specifies."""
     for logger in trainer.loggers:
         logger.finalize("success")
     if not ranks.is_first():
         return
+    folder, result = held.path, _result(job, held.path, psnr, trainer.global_step)
+    held.note(result=result)
     lines = profile_lines(trainer)
     if lines:
         say(*lines)
@@ -64,9 +67,8 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         report = read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine)
-        report.result = _result(job, folder, psnr, trainer.global_step)
         write_report(report, target)
-        say(f"result       {target}: {report.result}")
+        say(f"result       {target}: {result}")
     say(f"look at it   {_program()} view {to_type('ckpt', str(folder))} {trust_setting(job)}".rstrip())
 
 

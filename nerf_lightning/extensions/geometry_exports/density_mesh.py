@@ -143,7 +143,6 @@ def _only(
 
 VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.
 TOLERANCE = 0.015  # A vertex is visible if a view's depth equals its distance, up to this share of it.
-OPAQUE = 0.5  # Pixels with lower opacity see no surface.
 RINGS = 2  # Rings of faces that are added around visible ones, to avoid holes at grazing angles and thin parts.
 
 
@@ -152,6 +151,7 @@ def seen_faces(
     record: SceneRecord,
     vertices: Float[ndarray, "vertices 3"],
     faces: Int[ndarray, "faces 3"],
+    min_opacity: float,
     tile_points: int,
     report: Report,
 ) -> Int[ndarray, "seen 3"]:
@@ -160,8 +160,7 @@ def seen_faces(
     points = torch.from_numpy(vertices).float()
     seen = torch.zeros(len(points), dtype=torch.bool)
     for number, view in enumerate(views):
-        picture = see(model, record, cameras, view, tile_points)
-        depth = torch.where(picture.opacity > OPAQUE, picture.depth, torch.inf)
+        depth = see(model, record, cameras, view, tile_points).surface_depth(min_opacity)
         seen |= num_agreeing(points, cameras, {view: depth}, [view], TOLERANCE) > 0
         report("views", (number + 1) / len(views))
     known = seen.numpy()

@@ -27,7 +27,6 @@ BYTES_PER_POINT = 12  # The distance, its weight, and as much as one of them for
 # Maximum number of fused views, and of pixels of the longer side of their pictures, which otherwise equals the grid's
 # cells.
 VIEWS, LONGEST = 60, 512
-OPAQUE = 0.5  # Pixels with lower opacity see through the box.
 # A view at a grazing angle counts little; an empty pixel less than a surface; a coarse view less than a fine one.
 LEAST_COSINE, NOTHING, LEAST_SHARE = 0.05, 0.3, 0.25
 # Half the weight of one view that faces the surface: surfaces with less total weight are discarded.
@@ -35,7 +34,13 @@ LEAST_WEIGHT = 0.5
 
 
 def mesh_of_depth(
-    model: Model, record: SceneRecord, lattice: Lattice, truncation: float, tile_points: int, report: Report
+    model: Model,
+    record: SceneRecord,
+    lattice: Lattice,
+    truncation: float,
+    min_opacity: float,
+    tile_points: int,
+    report: Report,
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
     """Return vertices (scene frame) and faces of the surface that training views see; it is open where none looks.
 
@@ -49,7 +54,7 @@ def mesh_of_depth(
     rays_of = depth_rays(record, max(lattice.shape))
     cameras = rays_of.cameras
     for view in range(len(cameras.width)):
-        depth, trust = depth_view(model, record.background, rays_of, view, lattice.spacing, tile_points)
+        depth, trust = depth_view(model, record.background, rays_of, view, lattice.spacing, min_opacity, tile_points)
         numbers = torch.cat([cameras.c2w[view].reshape(-1), cameras.focal[view], cameras.center[view]]).numpy()
         fuse.add_view(distance, weight, lower, lattice.spacing, numbers, depth.numpy(), trust.numpy(), reach)
         report("depth", (view + 1) / len(cameras.width))
@@ -83,7 +88,13 @@ def _known(
 
 
 def depth_view(
-    model: Model, background: Background, rays_of: RayGenerator, view: int, spacing: float, tile_points: int
+    model: Model,
+    background: Background,
+    rays_of: RayGenerator,
+    view: int,
+    spacing: float,
+    min_opacity: float,
+    tile_points: int,
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Return one view's depth of the surface and its weight; `spacing` is that of the grid, in scene units.
 
@@ -97,7 +108,7 @@ def depth_view(
         depths.append(median_distances(levels[-1], part).cpu())
         opacities.append(levels[-1].opacity.cpu())
     depth = torch.cat(depths).view(rays.near.shape).float()
-    meets = torch.cat(opacities).view(rays.near.shape) > OPAQUE
+    meets = torch.cat(opacities).view(rays.near.shape) > min_opacity
     # Differences are steep next to an edge: it is unknown which surface pixels there see.
     down, along = torch.gradient(rays.origins + depth[..., None] * rays.directions, dim=(0, 1))
     normals = normalize(torch.linalg.cross(down, along), dim=-1)

@@ -149,7 +149,7 @@ class MeshExport(Export):
             require_library("xatlas", "texture")
             require_texture_room(self.texture_size)
         with StageProgress(COSTS[self.surface] | COLORING[self.texture]) as report:
-            vertices, faces = self._surface(model, record, lattice, tile_points, report)
+            vertices, faces = self._surface(model, record, lattice, run.min_opacity, tile_points, report)
             if run.crop is not None:
                 vertices, faces = in_box(vertices, faces, run.crop)
             vertices, faces = self._cleaned(vertices, faces)
@@ -186,16 +186,22 @@ class MeshExport(Export):
         return save(child_of(folder, f"mesh.{self.format}"), placed.numpy(), faces, turned.numpy(), frame=frame, **look)
 
     def _surface(
-        self, model: Model, record: SceneRecord, lattice: Lattice, tile_points: int, report: Report
+        self,
+        model: Model,
+        record: SceneRecord,
+        lattice: Lattice,
+        min_opacity: float,
+        tile_points: int,
+        report: Report,
     ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
         if self.surface == "tsdf":
-            return mesh_of_depth(model, record, lattice, self.truncation, tile_points, report)
+            return mesh_of_depth(model, record, lattice, self.truncation, min_opacity, tile_points, report)
         closed = self.format == "stl"
         vertices, faces = mesh_of_density(model, record, lattice, self.threshold, closed, tile_points, report)
         if closed:
             vertices, faces = without_cavities(vertices, faces)
         if self.seen_only:
-            faces = seen_faces(model, record, vertices, faces, tile_points, report)
+            faces = seen_faces(model, record, vertices, faces, min_opacity, tile_points, report)
         return vertices, faces
 
     def _cleaned(

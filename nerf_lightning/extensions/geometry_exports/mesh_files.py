@@ -21,6 +21,10 @@ MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points 
 """What each extra of this package is needed for."""
 
 
+COLORS = "_COLORS"
+"""An attribute of vertices for trimesh, whose own colors have 8 bits: too few for dark colors in linear light."""
+
+
 @dataclass(frozen=True)
 class GltfFrame:
     """The conversion to glTF, where y is up and a unit is a meter: the root node rotates and scales the frame.
@@ -34,7 +38,7 @@ class GltfFrame:
     """Length of a unit of that frame in meters; 1 if unknown."""
 
     def __call__(self, tree: dict[str, Any]) -> None:
-        """Set the root node's transform, and disable lighting in viewers: it is already in the colors."""
+        """Set the root node's transform, name the colors, and disable lighting in viewers: the colors include it."""
         (root,) = tree["scenes"][tree["scene"]]["nodes"]
         placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(torch.from_numpy(self.up)).numpy()
         tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # in column-major order
@@ -43,6 +47,10 @@ class GltfFrame:
         tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
         for primitive in (each for mesh in tree["meshes"] for each in mesh["primitives"]):
             primitive["material"] = 0
+            attributes = primitive["attributes"]
+            if COLORS in attributes:
+                attributes["COLOR_0"] = attributes.pop(COLORS)
+                tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
 
 
 def save_mesh(
@@ -56,9 +64,11 @@ def save_mesh(
     """Write a mesh with an sRGB color per vertex atomically; the extension determines the format."""
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
+    look: dict[str, Any] = {"vertex_colors": colors}
     if form == "glb":  # glTF interprets vertex colors as linear light
-        colors = np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
-    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
+        linear = to_linear(torch.from_numpy(np.insert(colors, 3, 255, axis=1) / 255.0)).numpy()
+        look = {"vertex_attributes": {COLORS: np.rint(65535.0 * linear).astype(np.uint16)}}
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False, **look)
     settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},

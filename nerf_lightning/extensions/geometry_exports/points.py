@@ -48,7 +48,6 @@ class PointsExport(Export):
         num_points: maximum number of points, which are drawn at random if there are more.
         max_views: maximum number of training views to render.
         longest: maximum length of the longer side of renders, in pixels.
-        min_opacity: minimum opacity of a pixel.
         agreement: how many of the 8 nearest views must see the same surface.
         tolerance: maximum relative difference of their depths.
         format: the file format: PLY, with normals, or LAS (1.2, point format 2) for survey software, without
@@ -60,7 +59,6 @@ class PointsExport(Export):
     num_points: int = 1_000_000
     max_views: int = 100
     longest: int = 400
-    min_opacity: float = 0.9
     agreement: int = 2
     tolerance: float = 0.01
     format: PointFormat = "ply"
@@ -71,8 +69,6 @@ class PointsExport(Export):
             require_setting(name, value, value >= least, f"give {least} or more.")
         asked = f"{NEIGHBOURS} other views are compared, so give at most that number."
         require_setting("agreement", self.agreement, self.agreement <= NEIGHBOURS, asked)
-        shares = "give a share of the light, from 0 to below 1."
-        require_setting("min_opacity", self.min_opacity, 0 <= self.min_opacity < 1, shares)
         require_setting("tolerance", self.tolerance, self.tolerance > 0, "give a share of the distance, above 0.")
 
     def export(
@@ -91,10 +87,10 @@ class PointsExport(Export):
         with StageProgress(COSTS) as report:
             for number, view in enumerate(views):
                 seen = see(model, record, cameras, view, tile_points)
-                opaque = (seen.opacity > self.min_opacity) & seen.depth.isfinite()
+                depths[view] = seen.surface_depth(run.min_opacity)
+                opaque = depths[view].isfinite()
                 kept = opaque & (seen.normals.norm(dim=-1) > 0.5)
                 clouds[view] = torch.cat([seen.points[kept], seen.normals[kept], seen.rgb[kept]], dim=-1)
-                depths[view] = torch.where(opaque, seen.depth, torch.inf)
                 candidates += int(opaque.sum())
                 opacities += [float(seen.opacity.min()), float(seen.opacity.max())]
                 report("depth", (number + 1) / len(views))
@@ -108,7 +104,7 @@ class PointsExport(Export):
         cloud = torch.cat(list(clouds.values()))
         del clouds
         if not len(cloud):
-            raise InputError(self._nothing(record, min(opacities), max(opacities), candidates))
+            raise InputError(self._nothing(record, min(opacities), max(opacities), candidates, run.min_opacity))
         log.info("%d of %d points are confirmed by other views", len(cloud), candidates)
         if run.crop is not None:
             cloud = cloud[run.crop.holds(cloud[:, :3])]
@@ -147,7 +143,7 @@ class PointsExport(Export):
             lambda longest: f"what.longest={longest} (or a smaller what.max_views)",
         )
 
-    def _nothing(self, record: SceneRecord, lowest: float, highest: float, candidates: int) -> str:
+    def _nothing(self, record: SceneRecord, lowest: float, highest: float, candidates: int, min_opacity: float) -> str:
         if candidates:
             return (
                 f"{candidates} pixels of {record.name} are opaque, but no point is confirmed by {self.agreement} other "
@@ -155,7 +151,7 @@ class PointsExport(Export):
             )
         return (
             f"There is no surface to export: the opacities of {record.name}'s training views go from {lowest:.3g} to "
-            f"{highest:.3g}, and what.min_opacity={self.min_opacity:g}. Train longer, or lower it."
+            f"{highest:.3g}, and min_opacity={min_opacity:g}. Train longer, or lower it."
         )
 
 

@@ -20,7 +20,9 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 RAYS = 1 << 13  # Number of rays of the training views that are used.
-OPAQUE = 0.9  # Rays with lower opacity have hit no surface.
+# Rays with lower opacity are left out. This is not `min_opacity`, below which nothing is exported: the level is a
+# quantile, of rays that have certainly met a surface.
+OPAQUE = 0.9
 # Four fifths of the rays end at a density above the level. At the median, thin and grazed surfaces have holes; much
 # lower, surfaces swell.
 QUANTILE = 0.2

@@ -88,7 +88,7 @@ class SplatFitting(Export):
         budget = self._budget(pinholes)
         around = look_around(model, record, tile_points, self.seed, report)
         first = max(1, budget // 2) if self.seconds else budget
-        gaussians = initial_gaussians(around, first, self.sh_degree, self.seed)
+        gaussians = initial_gaussians(around, first, self.sh_degree, self.seed, run.min_opacity)
         cropped(gaussians, run)  # refuses an empty box before the fitting, not after it
         if self.seconds:
             views = [] if photographs is None else training_views(record, photographs, pinholes, run.neutral)

@@ -28,7 +28,6 @@ WIDER = 1.25  # Factor by which they are wider than the photographs,
 WIDEST = 2.0  # and every other one if the scene has no box: windows are wider than photographs.
 NEAREST = 4  # A position is between a view and one of this many nearest ones,
 BEYOND = 0.5  # or beyond one of the two, by up to this share of the distance.
-LEAST_OPACITY = 0.5  # Pixels with lower opacity see no surface.
 TOLERANCE = 0.03  # Share of the distance: a point is kept if one of the nearest views has its surface there.
 OPACITY = 0.6
 SPREAD = 0.4  # Standard deviation along the surface, in distances to the three nearest neighbors.
@@ -79,7 +78,9 @@ def _between(cameras: Cameras, views: Sequence[int], generator: torch.Generator)
     return replace(cameras[chosen], c2w=c2w)
 
 
-def initial_gaussians(around: Surroundings, num_splats: int, sh_degree: int, seed: int) -> Gaussians:
+def initial_gaussians(
+    around: Surroundings, num_splats: int, sh_degree: int, seed: int, min_opacity: float
+) -> Gaussians:
     """Return `num_splats` splats, or fewer if fewer pixels see a surface that a second view confirms.
 
     Distant objects cover pixels like near ones, and so get as many, but larger, splats.
@@ -88,7 +89,7 @@ def initial_gaussians(around: Surroundings, num_splats: int, sh_degree: int, see
         InputError: no pixel sees a surface.
     """
     numbers, clouds = list(range(len(around.seen))), []
-    depths = {view: torch.where(s.opacity > LEAST_OPACITY, s.depth, torch.inf) for view, s in enumerate(around.seen)}
+    depths = {view: seen.surface_depth(min_opacity) for view, seen in enumerate(around.seen)}
     for view, seen in enumerate(around.seen):
         kept = depths[view].isfinite() & seen.points.isfinite().all(dim=-1)
         points, rgb = seen.points[kept], _rgba(seen)[kept][:, :3] / 255.0
@@ -100,7 +101,7 @@ def initial_gaussians(around: Surroundings, num_splats: int, sh_degree: int, see
         most = max(float(seen.opacity.max()) for seen in around.seen)
         raise InputError(
             f"There is no surface to put splats on: the field's opacity is at most {most:.3g} in {len(numbers)} views, "
-            f"and {LEAST_OPACITY} is needed in two that agree. Train longer."
+            f"and min_opacity={min_opacity:g} is needed in two that agree. Train longer, or lower it."
         )
     cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[:num_splats]]
     points, normals, rgb = cloud.split(3, dim=-1)

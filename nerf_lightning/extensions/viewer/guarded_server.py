@@ -113,7 +113,7 @@ def guarded_server(auth: Auth, port: int) -> "ViserServer":
     websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]
     try:
         with redirect_stdout(StringIO()):  # viser prints banners
-            server = ViserServer(auth.host, port, label="nerf_lightning", verbose=False)
+            server = ViserServer(auth.host, port, verbose=False)
     finally:
         websockets_server.serve = serve  # type: ignore[misc]
     if not guarded:

@@ -41,6 +41,7 @@ class Page:
         most_height: height of the finest image, in pixels.
         training: controls for the training that the page shows; None: no training.
         exports: folder of files that users can download; None: none.
+        run: name of the run's folder, which stands above the panel with the scene's name.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Page:
         most_height: int,
         training: TrainingSwitch | None = None,
         exports: Path | None = None,
+        run: str = "",
     ) -> None:
         require_viser()
         self.queue, self.photographs, self.folder, self.auth = queue, photographs, folder, auth
@@ -62,6 +64,8 @@ class Page:
         # Pages may be closed while a picture is being sent; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.server = guarded_server(auth, free_port(auth.host, port))
+        # viser has no way to set the title of the browser's tab.
+        self.server.gui.set_panel_label(f"{record.name}, {run}" if run else record.name)
         self._dress(record)
         self.server.on_client_connect(queue.errors.harmless(self._welcome))
         self.server.on_client_disconnect(queue.errors.harmless(lambda client: queue.remove(client.client_id)))

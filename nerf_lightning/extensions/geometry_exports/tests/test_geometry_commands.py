@@ -18,7 +18,7 @@ def last(finished_run):
 def test_every_kind_of_export_writes_what_it_says(nerf, last, tmp_path):
     settings = {
         "mesh": ("what.resolution=16", "what.threshold=1e-9", "what.seen_only=false", "what.format=obj"),
-        "points": ("what.min_opacity=0.0", "what.agreement=0", "what.max_views=2"),
+        "points": ("min_opacity=0.0", "what.agreement=0", "what.max_views=2"),
         "volume": ("what.resolution=8",),
     }
     for what, more in settings.items():

@@ -19,10 +19,12 @@ from nerf_lightning.export.base import RunContext
 from nerf_lightning.extensions.geometry_exports.density_mesh import without_floaters
 from nerf_lightning.extensions.geometry_exports.fused_mesh import depth_rays
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
+from nerf_lightning.extensions.geometry_exports.mesh_files import GltfFrame, save_mesh
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.world_frame import similarity, unit_of, upright_rotation
+from nerf_lightning.nerf.rendering.linear_light import to_linear
 
 RADIUS = 0.8
 TILE = 1 << 15
@@ -57,7 +59,8 @@ def test_only_the_surface_in_a_crop_box_is_written(tmp_path):
 def colors_of(mesh):
     visual = mesh.visual
     colors = visual.vertex_colors if hasattr(visual, "vertex_colors") else visual.vertex_attributes["color"]
-    return np.asarray(colors)[:, :3].astype(int)
+    full = np.iinfo(np.asarray(colors).dtype).max  # 16 bits in GLB, where trimesh leaves them as they are
+    return np.rint(255 * (np.asarray(colors)[:, :3] / full)).astype(int)
 
 
 @pytest.mark.parametrize("format", ["ply", "obj", "glb"])
@@ -138,6 +141,24 @@ def test_grey_is_the_same_grey_but_linear_in_glb(tmp_path, colors):
     for format, grey in (("ply", 102), ("glb", 34)):
         mesh = exported(tmp_path, model, record(), format=format, colors=colors, resolution=16)
         assert np.unique(colors_of(mesh)).tolist() == [grey]
+
+
+def test_glb_tells_all_colors_apart_in_linear_light(tmp_path):
+    colors = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+    vertices = np.random.default_rng(0).random((256, 3)).astype(np.float32)
+    faces, normals = np.arange(255).reshape(-1, 3), np.tile(np.float32([0, 0, 1]), (256, 1))
+    path = tmp_path / "mesh.glb"
+    save_mesh(path, vertices, faces, normals, GltfFrame(np.array([0.0, 0.0, 1.0]), 1.0), colors)
+    tree = _glb_tree(path)
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
+    view, content = tree["bufferViews"][accessor["bufferView"]], path.read_bytes()
+    binary = 28 + int.from_bytes(content[12:16], "little") + view["byteOffset"] + accessor["byteOffset"]
+    found = np.frombuffer(content, "<u2", 4 * accessor["count"], binary).reshape(-1, 4) / 65535
+    assert (found[:, 3] == 1).all()
+    # Back in sRGB, each is what it was.
+    known = to_linear(torch.arange(256) / 255.0).numpy()
+    np.testing.assert_array_equal(np.abs(found[:, :3, None] - known).argmin(axis=2), colors)
 
 
 def test_the_surface_is_where_the_depth_of_the_pictures_is(tmp_path):

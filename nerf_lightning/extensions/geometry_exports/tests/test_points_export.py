@@ -111,7 +111,7 @@ def test_forward_facing_captures_have_their_points_in_the_world(tmp_path):
 
 def test_an_empty_field_is_refused_with_the_opacities_seen(tmp_path):
     with pytest.raises(
-        InputError, match=r"opacities of ball's training views go from \S+ to 0\.0\d+, and what\.min_op"
+        InputError, match=r"opacities of ball's training views go from \S+ to 0\.0\d+, and min_opacity=0\.5"
     ):
         exported(tmp_path, solid(ball(), inside=0.01), record())
     with pytest.raises(InputError, match=r"no point is confirmed by 5 other views"):

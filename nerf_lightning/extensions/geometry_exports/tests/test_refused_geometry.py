@@ -115,3 +115,12 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch, what):
     with pytest.raises(OSError, match="No space left"):
         exported(tmp_path, what)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("what", [PointsExport(agreement=1), MeshExport(resolution=16, surface="tsdf")])
+def test_fainter_matter_than_asked_for_is_left_out_of_points_and_meshes(tmp_path, what):
+    """A ball that stops at most four fifths of the light."""
+    haze, scene = solid(ball(), inside=1.0), record()
+    with pytest.raises(InputError, match="There is no surface to export"):
+        what.export(haze, scene, tmp_path, TILE, base.RunContext(min_opacity=0.9))
+    assert what.export(haze, scene, tmp_path, TILE)[0].is_file()

@@ -1,9 +1,10 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
+const MIDDLE = matchMedia("(pointer: coarse)").matches ? "" : ", or press Enter for the middle";
 const ASKS = {
-  note: "Tap the place that the note is about, or press Enter for the middle.",
-  distance: "Tap the first point, or press Enter for the middle.",
-  second: "Tap the second point.",
+  note: `Tap the place that the note is about${MIDDLE}.`,
+  distance: `Tap the first point${MIDDLE}.`,
+  second: `Tap the second point${MIDDLE}.`,
 };
 
 class Marks {
@@ -50,7 +51,7 @@ class Marks {
       byId("told").textContent = "There is nothing here. Tap a surface.";
       return;
     }
-    const { focal, center } = lensIn(view, innerWidth, innerHeight);
+    const { focal, center } = lensIn(view);
     const ray = unit([(x - center[0]) / focal[0], (center[1] - y) / focal[1], -1]);
     const point = this.path.toUser(view.axes.reduce((sum, axis, i) => plus(sum, axis, away * ray[i]), view.eye));
     if (this.asks === "note") {
@@ -116,7 +117,7 @@ class Marks {
 
   // Labels stand at their points; those of points behind a surface are pale, those behind the camera hidden.
   place() {
-    const { view, picture } = this.frames, { focal, center } = lensIn(view, innerWidth, innerHeight);
+    const { view, picture } = this.frames, { focal, center } = lensIn(view);
     for (const { made, line, points } of this.drawn) {
       const seen = points.map((point) => {
         const [x, y, z] = view.axes.map((axis) => dot(axis, minus(point, view.eye)));

@@ -45,10 +45,15 @@ async function readScene(about) {
 
 // ---- The lens ----------------------------------------------------------------------------------------------------
 
-// Focal length and principal point of a view's lens, whose picture fits into the window, its middle in the window's. Of
-// scenes without bounds, where nothing is known beyond the photographs' edges, it fills a part of what would stay empty.
-function lensIn({ lens, about }, width, height) {
-  const fits = [width / lens.width, height / lens.height], least = Math.min(...fits), middle = [width / 2, height / 2];
+// Width and height of the part of the window (in pixels of CSS) above the strip of photographs, which would hide it.
+const shownPart = () => [innerWidth, innerHeight - document.querySelector("footer").offsetHeight];
+
+// Focal length and principal point of a view's lens, whose picture fits into that part of the window, in `ratio` pixels
+// to one of CSS. Of scenes without bounds, where nothing is known beyond the photographs' edges, it fills a part of what
+// would stay empty.
+function lensIn({ lens, about }, ratio = 1) {
+  const [width, height] = shownPart().map((side) => ratio * side), middle = [width / 2, height / 2];
+  const fits = [width / lens.width, height / lens.height], least = Math.min(...fits);
   const scale = about.unbounded ? least * Math.cbrt(Math.max(...fits) / least) : least;
   const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
   return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
@@ -215,9 +220,9 @@ function place(view) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
   if (!source) return;
-  const { scale } = lensIn(view, innerWidth, innerHeight);
-  const [width, height] = [scale * view.lens.width, scale * view.lens.height];
-  Object.assign(photograph.style, { width: `${width}px`, height: `${height}px`, left: `${(innerWidth - width) / 2}px`, top: `${(innerHeight - height) / 2}px` });
+  const { lens } = view, { scale, center } = lensIn(view), [left, top] = plus(center, lens.center, -scale);
+  const box = { width: scale * lens.width, height: scale * lens.height, left, top };
+  for (const [name, pixels] of Object.entries(box)) photograph.style[name] = `${pixels}px`;
   photograph.style.setProperty("--at", `${byId("wipe").value}%`);
   if (photograph.src !== source) photograph.src = source;
 }
@@ -270,10 +275,10 @@ function listenToKeys(frames) {
   const { marks } = frames, held = (key) => key in FLIGHT || key in TURNS || key in ZOOMS;
   const once = {
     1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
-    b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => home(frames),
+    b: () => byId("background").click(), h: () => hideControls(frames), home: () => home(frames),
     i: () => byId("numbers").showModal(), t: () => frames.turn(!frames.turning), f: fullScreen, p: () => savePicture(frames),
     v: () => marks.addView(), n: () => marks.begin("note"), m: () => marks.begin("distance"), escape: () => marks.begin(null),
-    enter: () => marks.tap(innerWidth / 2, innerHeight / 2), delete: () => marks.remove(), backspace: () => marks.remove(),
+    enter: () => marks.tap(...shownPart().map((side) => side / 2)), delete: () => marks.remove(), backspace: () => marks.remove(),
     " ": () => frames.player.toggle(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
@@ -293,6 +298,11 @@ function listenToKeys(frames) {
 function show(frames, what) {
   frames.view.shown = what;
   byId("shown").value = String(what);
+  frames.ask();
+}
+
+function hideControls(frames) {
+  document.body.classList.toggle("bare");
   frames.ask();
 }
 

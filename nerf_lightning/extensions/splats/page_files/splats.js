@@ -118,7 +118,7 @@ class Picture {
     const [width, height] = ["clientWidth", "clientHeight"].map((side) => Math.max(1, Math.round(this.canvas[side] * ratio)));
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    const { focal, center } = lensIn(view, width, height), away = length(minus(view.eye, this.about.middle));
+    const { focal, center } = lensIn(view, ratio), away = length(minus(view.eye, this.about.middle));
     gl.viewport(0, 0, width, height);
     gl.uniform2f(this.at("size"), width, height);
     gl.uniform2fv(this.at("focal"), focal);
@@ -141,7 +141,7 @@ class Picture {
   // How far away the surface is along the ray through a place of the window (in pixels of CSS): where half of the light
   // is stopped; 0: nowhere.
   depth(view, x, y) {
-    const { focal, center } = lensIn(view, innerWidth, innerHeight), { places, bytes, texels } = this.splats;
+    const { focal, center } = lensIn(view), { places, bytes, texels } = this.splats;
     const ray = unit([(x - center[0]) / focal[0], (center[1] - y) / focal[1], -1]);
     const look = view.axes.reduce((sum, axis, i) => plus(sum, axis, ray[i]), [0, 0, 0]);
     const pixel = this.dilation(focal) / focal[0] ** 2, [low, high] = this.about.scales, met = [];

@@ -7,7 +7,17 @@ import pytest
 import torch
 from support.browser import SIZES, drag, layout_faults, opened
 from support.contracted_hall import hall_model, hall_scene
-from support.page_in_browser import MESSAGE, drawn, drawn_through, press, psnr, shot, wait_for, wait_until_there
+from support.page_in_browser import (
+    MESSAGE,
+    drawn,
+    drawn_through,
+    hide_controls,
+    press,
+    psnr,
+    shot,
+    wait_for,
+    wait_until_there,
+)
 from support.shiny_ball import all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.commands.export import page_path
@@ -36,7 +46,7 @@ def test_it_shows_what_the_rasterizer_draws_and_asks_for_nothing(page):
     with opened(page.as_uri(), 256, 360) as driver:
         run = driver.execute_script
         wait_for(driver, "still")
-        run("document.body.classList.add('bare')")
+        hide_controls(driver)
         found = shot(driver)
         height, width = found.shape[:2]
         first = read_page(page)[0]["first"]
@@ -56,10 +66,25 @@ def test_it_shows_what_the_rasterizer_draws_and_asks_for_nothing(page):
 
 
 @pytest.mark.parametrize("page", [2], indirect=True)
-def test_nothing_overlaps_on_desktops_and_phones(page):
+def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
+    box = "document.getElementById(id).getBoundingClientRect()"
+    edges = f"return ['photograph', 'photographs', 'places'].map(id => {box})"
     with opened(page.as_uri(), 1280, 800) as driver:
         for size in SIZES:
             assert layout_faults(driver, size) == []
+            wait_for(driver, "still")
+            photograph, strip, places = driver.execute_script(edges)
+            assert photograph["top"] >= 0
+            assert photograph["bottom"] <= places["top"] + 1 < strip["top"]
+            assert strip["bottom"] == pytest.approx(SIZES[size][1])
+            # Nothing moves when the slider between scene and photograph goes.
+            press(driver, "arrowleft")
+            assert driver.execute_script(edges)[2] == places
+            driver.execute_script("dispatchEvent(new KeyboardEvent('keyup', {key: 'arrowleft'}))")
+            # Fingers or keys: what there is.
+            press(driver, "i")
+            controls = driver.find_element("css selector", "#numbers").text
+            assert ("two fingers" in controls, "Shift and drag" in controls) == (size == "phone", size != "phone")
             assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
             before = "document.getElementById('full').getBoundingClientRect()"
             left = driver.execute_script(f"return {before}.left")
@@ -71,7 +96,7 @@ def test_nothing_overlaps_on_desktops_and_phones(page):
 def test_firefox_shows_it_too(page):
     with opened(page.as_uri(), 500, 500, "Firefox") as driver:
         wait_for(driver, "still")
-        driver.execute_script("document.body.classList.add('bare')")
+        hide_controls(driver)
         found = shot(driver)
         assert psnr(found, drawn(page, read_page(page)[0]["first"], *found.shape[1::-1])) > 36
 
@@ -86,9 +111,8 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
         box = run("const b = document.getElementById('photograph').getBoundingClientRect(); return [b.width, b.height]")
         assert box[0] == pytest.approx(box[1])
         assert not run("return document.getElementById('photograph').hidden")
-        run("document.getElementById('wipe').value = 0; document.body.classList.add('bare')")
-        run("dispatchEvent(new Event('resize'))")
-        wait_for(driver, "still")
+        run("document.getElementById('wipe').value = 0")
+        hide_controls(driver)
         colors = shot(driver)
         for number in (1, 2):
             press(driver, str(number + 1))
@@ -104,7 +128,7 @@ def test_a_scene_without_bounds_is_shown_as_the_rasterizer_draws_it(tmp_path):
         page = what.export(hall_model(), record_of(scene), tmp_path, 1 << 14, run_of(scene))[0]
     with opened(page.as_uri(), 256, 360) as driver:
         wait_for(driver, "still")
-        driver.execute_script("document.body.classList.add('bare')")
+        hide_controls(driver)
         found = shot(driver)
         height, width = found.shape[:2]
         assert psnr(found, drawn(page, read_page(page)[0]["first"], width, height, 0.0)) > 38
@@ -149,7 +173,7 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
         driver.execute_cdp_cmd("Browser.setDownloadBehavior", saves)
         wait_for(driver, "still")
         assert run("return document.getElementById('length').value") == "10.0 s"
-        run("document.body.classList.add('bare')")
+        hide_controls(driver)
         found = to_second(driver, 4.25)
         assert found.std() > 0.1
         assert psnr(found, seen_by(Orbit(120, fps=12), page, record, 4.25, found)) > 36  # a curve through 25 of 120

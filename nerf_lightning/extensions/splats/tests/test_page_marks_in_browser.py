@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from support.browser import drag, opened
-from support.page_in_browser import drawn, press, psnr, shot, wait_for, wait_until_there
+from support.page_in_browser import drawn, hide_controls, press, psnr, shot, wait_for, wait_until_there
 from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.extensions.splats.page import PageExport
@@ -49,7 +49,7 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
         assert run("return document.title") == EVIL
         assert run("return document.querySelector('#pins .note').textContent") == EVIL
         assert run("return document.querySelectorAll('#pins img, #views img').length") == 0
-        run("document.body.classList.add('bare')")
+        hide_controls(driver)
         found = shot(driver)
         height, width = found.shape[:2]
         assert psnr(found, drawn(page, 2, width, height)) > 38

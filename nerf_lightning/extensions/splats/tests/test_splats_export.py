@@ -35,9 +35,9 @@ from nerf_lightning.nerf.rendering.linear_light import scale_light, to_linear
 TILE = 1 << 15
 
 
-def exported(folder, model, scene, photographs=True, crop=None, **settings):
+def exported(folder, model, scene, photographs=True, crop=None, min_opacity=0.5, **settings):
     export = SplatsExport(**({"num_splats": 600, "seconds": 0.0, "sh_degree": 1} | settings))
-    run = RunContext(photographs=scene if photographs else None, crop=crop)
+    run = RunContext(photographs=scene if photographs else None, crop=crop, min_opacity=min_opacity)
     with torch.no_grad():
         written = export.export(model, scene_record(scene), folder, TILE, run)
     return json.loads((folder / "splats.json").read_text()), written
@@ -204,7 +204,11 @@ def rows_of(ply):
 def test_empty_fields_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"no surface to put splats on: the field's opacity is at most 0\.\d+"):
         exported(tmp_path, solid(ball(), inside=0.01), ball_scene(num_views=8, size=24))
+    haze = solid(ball(), inside=1.0), ball_scene(num_views=8, size=24)  # stops at most four fifths of the light
+    with pytest.raises(InputError, match=r"min_opacity=0\.9 is needed in two that agree"):
+        exported(tmp_path, *haze, min_opacity=0.9)
     assert not list(tmp_path.iterdir())
+    exported(tmp_path, *haze)
 
 
 def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch):

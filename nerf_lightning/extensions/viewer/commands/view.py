@@ -34,7 +34,8 @@ def run(config: DictConfig) -> None:
     queue = RenderQueue(renderer)
     photographs = Photographs(record, scene, background)
     exports = beside_checkpoint(opened.checkpoint.path, "export")
-    page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports)
+    name = exports.parent.name
+    page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports, run=name)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page does not need them to start

@@ -103,7 +103,7 @@ def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
 
 
 @pytest.mark.minutes
-def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page):
+def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page, finished_run):
     with opened(page.address) as browser:
         first = wait_until(browser, lambda picture: picture.std() > 10)
         drag(browser, 120, 30)
@@ -111,7 +111,7 @@ def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page):
         assert moved.std() > 10
         browser.refresh()
         wait_until(browser, lambda picture: picture.std() > 10)
-        assert "nerf_lightning" in browser.page_source
+        assert f", {finished_run.name}<" in browser.page_source
 
 
 def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
