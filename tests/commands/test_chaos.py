@@ -30,9 +30,10 @@ QUIET = (
 
 @dataclass(frozen=True)
 class Phase:
-    """A command, the function whose run is the phase, and what is looked at afterwards."""
+    """A command, the function where a kill hits it amid a file, and a size (bytes) that its files exceed."""
 
     function: str
+    largest: int
     arguments: tuple[str, ...]
     results: str = "*"
     """Files that the command writes; the others of its folder only must not be more."""
@@ -41,31 +42,28 @@ class Phase:
 # Each a way of writing of its own.
 PHASES = {
     "evaluating": Phase(
-        "nerf_lightning.evaluation.evaluator:Scoring.score",
+        "PIL.Image:Image.save",
+        2500,
         ("eval", "ckpt={last}", "scene=npz", "scene.path={capture}", "trainer.num_threads=1"),
     ),
     "filming": Phase(
-        "nerf_lightning.video.frames:FilmFrames.open",
+        "nerf_lightning.video.encoding:_counted",
+        1000,
         ("render", "ckpt={last}", "path.num_frames=4", "trainer.num_threads=1"),
     ),
     "exporting images": Phase(
-        "nerf_lightning.export.images:ImagesExport.export",
+        "nerf_lightning.export.images:write_json",
+        1000,
         ("export", "ckpt={last}", "what=images", "what.max_views=3", "trainer.num_threads=1"),
     ),
     "decoding": Phase(
-        "nerf_lightning.data.pixels.mapped_store:_make",
+        "nerf_lightning.data.pixels.mapped_store:_spots",
+        2500,
         ("train", "scene=transforms", "scene.root={photographs}", "scene.cache_dir={out}/cache", *FAST, *QUIET,
          "trainer.max_steps=1", "resume=auto"),
         "cache/*",
     ),
 }  # fmt: skip
-# Where a kill hits a phase amid a file, and a size (bytes) that its files exceed.
-QUICK = {
-    "evaluating": ("PIL.Image:Image.save", 2500),
-    "filming": ("nerf_lightning.video.encoding:_counted", 1000),
-    "exporting images": ("nerf_lightning.export.images:write_json", 1000),
-    "decoding": ("nerf_lightning.data.pixels.mapped_store:_spots", 2500),
-}
 
 
 @pytest.fixture(scope="module")
@@ -111,48 +109,20 @@ def _read(file):
     return None if with_times else hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def never_killed(phase, places, out):
-    """Return what a command writes that nothing befalls, and the seconds from the beginning of the phase to the end."""
-    codes, told = run_as_planned(phase, [{"phase": phase.function}], places, out)
-    assert codes == [0], told
-    return content(phase, out), float(out.with_name(f"{out.name}.seconds").read_text())
-
-
 @pytest.mark.minutes
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES)
 @POSIX
-def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(name, places, tmp_path):
-    phase, out, (amid, largest) = PHASES[name], tmp_path / "out", QUICK[name]
-    wanted, _ = never_killed(phase, places, tmp_path / "never")
-    codes, told = run_as_planned(phase, [{"largest": largest}, {"phase": amid, "after": 0}, None], places, out)
-    assert codes == [2, -signal.SIGALRM, 0], told
+def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(phase, places, tmp_path):
+    codes, told = run_as_planned(phase, [None], places, tmp_path / "never")
+    assert codes == [0], told
+    wanted, out = content(phase, tmp_path / "never"), tmp_path / "out"
+    codes, told = run_as_planned(phase, [{"largest": phase.largest}, {"in": phase.function}, None], places, out)
+    assert codes == [2, -signal.SIGKILL, 0], told
     assert "Traceback" not in told
     (paragraph,) = [line for line in told.splitlines() if line.startswith("nerf: ")]
     assert str(out) in paragraph
     assert "File too large" in paragraph or "ffmpeg failed" in paragraph
     assert content(phase, out) == wanted, told
-
-
-@pytest.mark.slow
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", PHASES)
-@POSIX
-def test_a_command_that_is_killed_at_50_moments_ends_the_same(name, places, tmp_path):
-    phase, killed = PHASES[name], 0
-    wanted, seconds = never_killed(phase, places, tmp_path / "never")
-    for number in range(500):
-        # Training follows, where the phase is an early one: more of the moments lie at the beginning.
-        out, after = tmp_path / f"killed_{number}", seconds * random.random() ** 3
-        codes, told = run_as_planned(phase, [{"phase": phase.function, "after": after}, None], places, out)
-        story = f"{after:.6f} s into the phase\n{told}"
-        assert codes[0] in (0, -signal.SIGALRM), story
-        assert codes[1] == 0, story
-        assert "Traceback" not in told, story
-        assert content(phase, out) == wanted, story
-        killed += codes[0] != 0
-        if killed == 50:
-            return
-    pytest.fail(f"only {killed} of 500 planned kills came before the end")
 
 
 def train(capture, folder, steps, *more):

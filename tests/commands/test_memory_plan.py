@@ -18,25 +18,6 @@ from nerf_lightning.training.build_step import build_step
 CPU = torch.device("cpu")
 
 
-def test_what_a_chain_of_layers_holds_is_counted_to_the_byte_and_views_take_nothing():
-    weight, points = torch.randn(8, 8, requires_grad=True), torch.randn(1000, 8)
-
-    def forward():
-        hidden = points
-        for _ in range(3):
-            hidden = torch.nn.functional.linear(hidden, weight)
-        return hidden
-
-    layer = 1000 * 8 * 4
-    with torch.no_grad():
-        assert peak_bytes(forward, CPU) == 2 * layer  # one goes in, one comes out
-    assert peak_bytes(forward, CPU) == 3 * layer  # the way back needs what lies between
-    assert peak_bytes(forward, torch.device("meta")) == 0
-    before = torch.zeros(1000)
-    assert peak_bytes(lambda: before.view(10, 100).t().add_(1.0), CPU) == 0
-    assert peak_bytes(lambda: before + 1.0, CPU) == 4000
-
-
 def built_for(name, threads, tile):
     torch.set_num_threads(threads)
     config = composed("train", f"model={name}", "trainer.accelerator=cpu", f"trainer.tile_points={tile}")

@@ -3,10 +3,7 @@
 import json
 
 import pytest
-import yaml
-from support.running import refused, said
-
-from nerf_lightning.runs.saved_overrides import former_overrides
+from support.running import said
 
 MINE = '''
 from pathlib import Path
@@ -67,21 +64,6 @@ def test_a_class_that_is_no_callback_or_not_there_is_told(train, my_package, tmp
     monkeypatch.syspath_prepend(tmp_path)
     said(train("+callbacks.mine._target_=my_package.Missing"), "callbacks.mine", "Missing")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "+callbacks.mine._target_=os.system",
-        "+callbacks.mine={_target_: os.system}",
-        "++trainer.lightning.profiler={_target_: os.system}",
-        "callbacks.monitor._target_=os.system",
-    ],
-)
-def test_a_strangers_run_folder_names_no_callback(tmp_path, line):
-    (tmp_path / ".hydra").mkdir()
-    (tmp_path / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([line]))
-    refused(former_overrides, tmp_path, [f"resume={tmp_path}"], parts=("which is not taken from a file",))
 
 
 def test_flags_of_lightnings_need_no_plus(train, tmp_path):

@@ -118,6 +118,8 @@ PLANTED = [
     # Classes and programs.
     "scene._target_=os.system",
     "callbacks={evil:{deep:[{_target_:os.system}]}}",
+    "+callbacks.mine._target_=os.system",
+    "++trainer.lightning.profiler={_target_: os.system}",
     "+trainer._args_=[1]",
     "--config-dir=/tmp/evil",
     "encoder@callbacks.evil=frequency",

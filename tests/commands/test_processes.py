@@ -120,25 +120,6 @@ def test_a_worker_ends_with_the_process_that_has_started_it():
 
 
 @pytest.mark.exhaustive
-@POSIX
-def test_workers_end_with_the_process_that_has_started_them(capture, tmp_path):
-    process = start(*arguments(capture, *TWO, "trainer.max_steps=1000000", f"paths.output_dir={tmp_path}"))
-    while process.poll() is None and saved(tmp_path)["global_step"] == 0:
-        time.sleep(0.02)
-    workers = [each for each in psutil.Process(process.pid).children() if "nerf_lightning.cli.worker" in each.cmdline()]
-    process.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + 30
-    while living := [worker for worker in workers if is_alive(worker)]:
-        if time.monotonic() > deadline:
-            for worker in living:
-                worker.kill()
-            pytest.fail(f"{len(living)} workers live on")
-        time.sleep(0.05)
-    code, output = finished(process)
-    assert (code, len(workers)) == (-signal.SIGKILL, 2), output
-
-
-@pytest.mark.exhaustive
 def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
     for name, extra in (("one", ()), ("two", TWO)):
         code, output = finished(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
@@ -162,45 +143,29 @@ def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
     assert steps == {"0_seed=0": 3, "1_seed=1": 3}
 
 
-def test_what_was_not_started_is_said(nerf, capture, monkeypatch):
-    for name in ("torchrun", "slurm"):
-        result = nerf(*arguments(capture, f"trainer={name}"))
-        assert result.code == 2
-        assert f"trainer={name}: this process was not started by" in result.err
-
-
-def test_processes_that_would_train_alone_are_refused(nerf, capture, monkeypatch):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
-    result = nerf(*arguments(capture))
-    assert result.code == 2
-    assert "Add trainer=torchrun" in result.err
-
-
-def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
-    command, *rest = arguments(capture, "trainer=torchrun", "seed=0,1", f"paths.output_dir={tmp_path}")
-    result = nerf(command, "-m", *rest)
-    assert result.code == 2
-    assert "each of the processes would run the sweep by itself" in result.err
-
-
+TORCHRUN = {"TORCHELASTIC_RUN_ID": "1"}
 SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
+SLURM = {f"SLURM_{name}": value for name, value in SLURM.items()}
 
 
 @pytest.mark.parametrize(
-    ("trainer", "more", "words"),
+    ("environment", "more", "words"),
     [
-        ("cpu", {}, ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
-        ("slurm", {}, ("not started by Slurm's srun",)),
-        ("slurm", {"STEP_ID": "0"}, ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
+        ({}, ["trainer=torchrun"], ("trainer=torchrun: this process was not started by",)),
+        ({}, ["trainer=slurm"], ("trainer=slurm: this process was not started by",)),
+        (TORCHRUN, [], ("Add trainer=torchrun",)),
+        (TORCHRUN, ["trainer=torchrun", "seed=0,1", "-m"], ("each of the processes would run the sweep by itself",)),
+        (SLURM, [], ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
+        (SLURM, ["trainer=slurm"], ("not started by Slurm's srun",)),
+        (SLURM | {"SLURM_STEP_ID": "0"}, ["trainer=slurm"], ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
     ],
 )
-def test_a_slurm_job_whose_tasks_would_not_train_together_is_refused(
-    nerf, capture, monkeypatch, tmp_path, trainer, more, words
+def test_processes_that_would_not_train_together_are_refused(
+    nerf, capture, monkeypatch, tmp_path, environment, more, words
 ):
-    for name, value in (SLURM | more).items():
-        monkeypatch.setenv(f"SLURM_{name}", value)
-    said(nerf(*arguments(capture, f"trainer={trainer}", f"paths.output_dir={tmp_path}/run")), *words)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    said(nerf(*arguments(capture, f"paths.output_dir={tmp_path}/run", *more)), *words)
     assert not (tmp_path / "run").exists()
 
 

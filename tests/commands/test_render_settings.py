@@ -12,7 +12,7 @@ import pytest
 import torch
 from support.known_fields import INSIDE, solid
 from support.peak_bytes import peak_bytes
-from support.running import FAST, said, start
+from support.running import FAST, said
 from support.scenes import ball_scene, tiny_field
 from torch import nn
 
@@ -108,6 +108,7 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
         (["outputs=[rgb,color]"], ["this model shows no color", "rgb, depth, opacity, normals, levels"]),
         (["mosaic=maybe"], ["mosaic=maybe", "true or false"]),
         (["format=gif"], ["format=gif", "animation (WebP"]),
+        (["background=red"], ["background=red"]),
         (["near=-1"], ["near=-1", "not negative"]),
         (["near=7"], ["near=7 leaves nothing to see", "rays end at"]),
         (["crop=[[0,0,0]]"], ["crop=[[0, 0, 0]]", "lower and the upper corner"]),
@@ -240,20 +241,6 @@ def test_a_film_is_of_one_precision(last, rendered):
     assert np.array_equal(after, alone)
 
 
-@pytest.mark.exhaustive
-def test_two_processes_share_the_frames(nerf, last, tmp_path):
-    arguments = ["render", f"ckpt={last}", *SMALL, "path.num_frames=5", "format=frames"]
-    assert nerf(*arguments, "trainer=cpu", f"paths.output_dir={tmp_path}/one").code == 0
-    two = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", f"paths.output_dir={tmp_path}/two")
-    process = start(*arguments, *two)
-    output, _ = process.communicate(timeout=200)
-    assert process.returncode == 0, output
-    for name in ("video", "depth"):
-        for number in range(5):
-            one, other = (iio.imread(tmp_path / run / name / f"frame_{number:04d}.png") for run in ("one", "two"))
-            assert np.abs(one.astype(int) - other).max() <= 1
-
-
 SIDE = 256
 EVERYTHING = ("rgb", "depth", "opacity", "normals", "levels")
 CROP = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -341,6 +328,5 @@ def test_nothing_is_begun_of_a_film_that_would_not_fit(tmp_path, monkeypatch):
 def test_training_does_not_begin_where_its_film_would_not_fit(capture, nerf, tmp_path):
     run = tmp_path / "run"
     result = nerf("train", *FAST, "scene=npz", f"scene.path={capture}", "path.width=3000000", f"paths.output_dir={run}")
-    assert result.code == 2
-    assert "A frame of 3000000 x 3000000 pixels" in result.err
+    said(result, "A frame of 3000000 x 3000000 pixels")
     assert not list(run.rglob("*.ckpt"))

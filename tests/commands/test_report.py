@@ -134,13 +134,8 @@ EVIL = (
 @pytest.fixture
 def evil_run(tmp_path):
     """A run whose every text is markup."""
-    run = leave_measured_run(
-        tmp_path / "run",
-        overrides=(EVIL,),
-        protocol={EVIL: EVIL, "scene": EVIL},
-        origin={"model": EVIL, EVIL: [EVIL]},
-        started=EVIL,
-    )
+    texts = {"protocol": {EVIL: EVIL, "scene": EVIL}, "origin": {"model": EVIL, EVIL: [EVIL]}, "started": EVIL}
+    run = leave_measured_run(tmp_path / "run", overrides=(EVIL,), **texts)
     metrics = json.loads((run / "metrics.json").read_text())
     metrics |= {"per_image": [{"name": EVIL, "psnr": 20.0}], "worst_views": [EVIL], "pictures": ["../../secret", EVIL]}
     metrics["environment"] = {"torch": EVIL}

@@ -118,14 +118,6 @@ def test_a_run_of_a_version_that_counted_the_budget_to_it_goes_on(tmp_path, lost
         open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
 
 
-def test_a_config_that_lost_settings_since_the_run_began_is_another_one(tmp_path):
-    run = begin(config(tmp_path, f"paths.output_dir={tmp_path}/here", "model.subpixels=2"))
-    write_config(run.path, without(config(tmp_path), "model.subpixels"), OmegaConf.create(HYDRA))
-    run.release()
-    with pytest.raises(InputError, match="contains a run with other settings"):
-        open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
-
-
 def test_a_setting_that_a_run_had_and_the_program_lost_is_another_config(tmp_path):
     here = f"paths.output_dir={tmp_path}/here"
     begin(config(tmp_path, here)).release()

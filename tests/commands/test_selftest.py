@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from support.running import said
 
 from nerf_lightning.commands import selftest
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
@@ -47,15 +48,4 @@ def test_kernels_that_are_off_by_one_percent_or_raise_are_wrong_and_the_rest_goe
 
 def test_other_devices_are_refused_in_one_paragraph(nerf, monkeypatch):
     monkeypatch.setattr(selftest, "DEVICES", ())
-    result = nerf("selftest", "trainer=cpu")
-    assert result.code == 2
-    assert "nerf selftest supports CPUs and NVIDIA GPUs" in result.err
-
-
-@pytest.mark.exhaustive
-def test_the_whole_of_it(nerf, tmp_path):
-    result = nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out")
-    assert result.code == 0, result.out
-    rows = json.loads((tmp_path / "out" / "selftest.json").read_text())["checks"]
-    for words in ("hash grid", "PSNR after"):
-        assert any(words in row["name"] and row["outcome"] == "ok" for row in rows), words
+    said(nerf("selftest", "trainer=cpu"), "nerf selftest supports CPUs and NVIDIA GPUs")

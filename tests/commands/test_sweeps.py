@@ -15,7 +15,6 @@ from support.systems import POSIX
 
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.runs import sweep
-from nerf_lightning.runs.sweep_job import stop_file
 
 ALL_CORES = """
 import os, sys
@@ -110,11 +109,8 @@ def test_a_search_maximises_the_psnr_and_goes_on_where_it_was(capture, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["basic", pytest.param("parallel", marks=pytest.mark.exhaustive)])
-def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
-    code, output = run(
-        *arguments(capture, tmp_path, f"hydra/launcher={launcher}", "data.batch_rays=-1,64", "optimizer.lr=1e-3")
-    )
+def test_a_job_that_fails_costs_only_itself(capture, tmp_path):
+    code, output = run(*arguments(capture, tmp_path, "data.batch_rays=-1,64", "optimizer.lr=1e-3"))
     assert code == 2, output
     assert "Traceback" not in output
     complaint = "1 of 2 jobs failed. 0_data.batch_rays=-1: data.batch_rays=-1: at least one ray is needed."
@@ -145,18 +141,16 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("how", [pytest.param("Ctrl-C", marks=POSIX), "the stop file, as on Windows"])
-def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path, how):
+@POSIX
+def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
+    """By the stop file, as on Windows: tests/test_other_systems.py."""
     longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
     process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)
     for folder in ("0_seed=0", "1_seed=1"):
         wait_for_step(tmp_path / folder, 10, process)
-    if how == "Ctrl-C":
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    else:
-        stop_file(tmp_path).touch()
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     code, output = finished(process)
-    assert code == (130 if how == "Ctrl-C" else 1), output
+    assert code == 130, output
     assert [row["state"] for row in table(tmp_path)] == ["stopped", "stopped"]
     assert output.count("stopped at step") == 2
     assert f"resume with  nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output

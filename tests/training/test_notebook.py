@@ -232,7 +232,7 @@ def test_a_run_that_a_clock_ends_is_warned_of_its_learning_rate(run, trainer, ca
     assert "budget.seconds=N" in caplog.text
 
 
-@pytest.mark.parametrize("settings", [(), FAST_PATH, ("field.batch_norm=true",)])
+@pytest.mark.parametrize("settings", [(), FAST_PATH, ("field.batch_norm=true",), ("loss=robust", "loss.patch=4")])
 def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, settings):
     whole, rest, found = whole_and_resumed(lambda: run(*settings, "scheduler=constant"), trainer, stop=12, steps=24)
     assert found.endswith("step=12.ckpt")
