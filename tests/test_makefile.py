@@ -18,8 +18,3 @@ def test_help_lists_every_target_in_two_columns():
     ).stdout
     assert shown.splitlines() == [f"{name:<20}{text}" for name, text in TARGETS]
     assert len(TARGETS) > 20
-
-
-def test_recipes_leave_tabs_to_no_sed():
-    """BSD's sed writes the letter t for \\t."""
-    assert not re.search(r"\bsed\b.*\\t", MAKEFILE.read_text(encoding="utf-8"))

@@ -1,6 +1,5 @@
 """What a run loads before its first step: nothing heavy that it does not need, the rest without a pause."""
 
-import gc
 import subprocess
 import sys
 
@@ -8,7 +7,7 @@ import pytest
 from support.cold_import import cold_import
 
 from nerf_lightning.cli import prepare
-from nerf_lightning.cli.process import announce_start, quick_imports
+from nerf_lightning.cli.process import announce_start
 from nerf_lightning.config.scene_overrides import UnknownScene
 
 
@@ -47,15 +46,6 @@ def test_the_collector_rests_while_lightning_is_loaded_and_scipys_signals_wait_f
     during, loaded, after, *_, asked = cold_import(tmp_path_factory)
     assert (during, after) == ("False", "True True")
     assert (loaded, asked) == ("[]", "3 True")
-
-
-def test_later_jobs_of_a_sweep_leave_nothing_behind():
-    import lightning  # noqa: F401
-
-    before = gc.get_freeze_count()
-    with quick_imports():
-        assert gc.isenabled()
-    assert gc.get_freeze_count() <= before
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,10 @@ def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, ca
     content["poses"][3, 0, 3] += 0.5
     np.savez(tmp_path / "ball.npz", **content)
     again = (*command, "trainer.max_steps=12", "resume=auto")
-    said(nerf(*again), what, "resume_changed_capture=true")
+    result = nerf(*again)
+    assert result.code == 2, result.err
+    assert what in result.err.splitlines()[-1]
+    assert "resume_changed_capture=true" in result.err.splitlines()[-1]
     result = nerf(*again, "resume_changed_capture=true")  # the refusal has left the run as it was
     assert result.code == 0, result.err
     assert what in result.out + result.err

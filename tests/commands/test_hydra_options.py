@@ -104,7 +104,3 @@ def test_a_value_that_hydra_cannot_read_is_written_out_with_quotes(nerf, name):
 def test_a_folder_needs_no_quotes_and_a_line_may_end_as_on_windows(nerf, end):
     words = ["doctor", "scene=colmap", "scene.root=新加卷/fox (1)"]
     said(nerf(*(f"{word}{end}" for word in words), *[end] * bool(end)), "The folder 新加卷/fox (1) does not exist")
-
-
-def test_spaces_around_the_equals_sign_are_told(nerf):
-    said(nerf("eval", "ckpt=", "data/x"), "Settings are key=value without spaces, such as scene.root=data/x")

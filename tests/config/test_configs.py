@@ -1,6 +1,7 @@
 """Every yaml of conf/ composes and builds."""
 
 import inspect
+from dataclasses import asdict
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from support.configs import composed, loaded, options
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.base import Export
-from nerf_lightning.files.folders import conf_file, conf_folder
+from nerf_lightning.files.budgets import Budgets
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = (
@@ -148,9 +149,9 @@ def test_every_export_builds(option):
     assert isinstance(build(composed("export", f"what={option}").what), Export)
 
 
-@pytest.mark.parametrize("command", [name for name in find_commands() if conf_file(name).parent == conf_folder()])
+@pytest.mark.parametrize("command", sorted(find_commands()))
 def test_every_command_composes(command):
-    assert "budgets" in composed(command)
+    assert composed(command).budgets == asdict(Budgets())
 
 
 def targets(node, path=""):

@@ -39,13 +39,6 @@ def test_ssim_of_two_flat_images_by_hand():
     assert math.isclose(image_metrics(render, truth)["ssim"], wanted, abs_tol=1e-4)
 
 
-def test_ssim_falls_with_noise():
-    truth = torch.rand(32, 32, 3)
-    noise = torch.randn(32, 32, 3)
-    scores = [image_metrics(truth + level * noise, truth)["ssim"] for level in (0.02, 0.1, 0.3)]
-    assert 1.0 > scores[0] > scores[1] > scores[2] > 0.0
-
-
 def test_ssim_has_the_window_of_its_paper():
     """A Gaussian of 1.5 pixels over 11 x 11 of them (Wang et al. 2004)."""
     render, truth = torch.rand(2, 32, 27, 3)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
+from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.evaluation.metrics_files import METRICS, summary, write_metrics
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.runs.results import read_result
@@ -39,10 +40,6 @@ def test_what_is_no_number_is_null_however_deep_it_lies(tmp_path, number):
 
 
 def test_a_view_that_is_background_alone_keeps_the_runs_numbers(tmp_path):
-    import torch
-
-    from nerf_lightning.evaluation.metrics import image_metrics
-
     white, render = torch.ones(16, 16, 3), torch.full((16, 16, 3), 0.9)
     rows = [row("empty", **image_metrics(white, white)), row("b", **image_metrics(render, white))]
     write_metrics(tmp_path, summary(rows))
@@ -69,10 +66,3 @@ def test_the_worst_of_all_processes_are_kept_in_order(tmp_path):
     written = sorted(path.relative_to(tmp_path / "images").as_posix() for path in tmp_path.rglob("*.png"))
     assert [name for name in written if "/" not in name] == ["worst_1.png", "worst_2.png"]
     assert "views/worst_1/truth.png" in written
-
-
-def test_none_are_kept_where_none_are_wanted(tmp_path):
-    kept = KeptViews(tmp_path, "test", num_worst=0)
-    kept.watch("a", 30.0, view(0.5))
-    assert kept.finish([{"name": "a", "psnr": 30.0}]) == []
-    assert not list(tmp_path.iterdir())

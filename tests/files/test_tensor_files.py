@@ -1,6 +1,5 @@
 """PyTorch's files as plain containers and tensors, whatever their pickles make of themselves."""
 
-import os
 import pickle
 import struct
 import zipfile
@@ -10,7 +9,6 @@ import pytest
 import torch
 from support.planted import replace_pickle, write_checkpoint
 from support.running import refused
-from support.systems import POSIX
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
@@ -173,9 +171,3 @@ def test_lists_in_lists_without_end_are_refused(tmp_path):
     for endless_pickle in (b"]" * 20_000 + b"a" * 19_999, b"]q\x00h\x00a"):
         replace_pickle(path, b"\x80\x02" + endless_pickle + b".")
         refused(read_checkpoint, path, parts=("a.ckpt",))
-
-
-@POSIX
-def test_what_lies_in_the_place_of_a_checkpoint_is_named(tmp_path):
-    os.mkfifo(tmp_path / "last.ckpt")
-    refused(read_checkpoint, tmp_path / "last.ckpt", parts=("last.ckpt is a named pipe (FIFO)",))

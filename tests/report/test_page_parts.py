@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
 from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
-from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, embedded_video, write_report
+from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
 
 
 def decoded(picture):
@@ -33,19 +32,6 @@ def test_nothing_of_a_file_but_its_pixels_comes_into_a_page(tmp_path):
     path.write_bytes(path.read_bytes() + b"planted behind the end")
     content = base64.b64decode(embedded_file(path).source.partition(",")[2])
     assert b"planted" not in content
-
-
-def test_what_is_no_film_is_refused(tmp_path):
-    path = tmp_path / "a.mp4"
-    with pytest.raises(InputError, match="does not exist"):
-        embedded_video(path, 100)
-    path.write_bytes(b"<html>")
-    with pytest.raises(InputError, match="not an mp4"):
-        embedded_video(path, 100)
-    path.write_bytes(b"\0\0\0\x18ftypisom")
-    assert embedded_video(path, 100).startswith("data:video/mp4;base64,")
-    with pytest.raises(InputError, match="max_megabytes"):
-        embedded_video(path, 5)
 
 
 def test_known_curves_are_drawn_together_and_unknown_names_are_not():

@@ -13,9 +13,8 @@ FEW = "number of views"
 
 def warnings(caplog, *scene):
     caplog.clear()
-    build_run(
-        *scene, *(setting for setting in FAST if setting.startswith(("model", "data"))), "trainer=cpu", "doctor=off"
-    )
+    small = [setting for setting in FAST if setting.startswith(("model", "data"))]
+    build_run(*scene, *small, "trainer=cpu", "doctor=off")
     return [record.message for record in caplog.records if record.levelname == "WARNING" and FEW not in record.message]
 
 

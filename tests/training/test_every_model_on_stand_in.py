@@ -151,7 +151,7 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
     assert all(kernel.launched >= STEPS for pair in kernels.values() for kernel in pair)
 
 
-@pytest.mark.parametrize("model", ["fast", "fast_small", "fast_large", "nerf_occupancy"])
+@pytest.mark.parametrize("model", ["fast_small", "nerf_occupancy"])
 def test_arrays_of_samples_hold_twice_what_a_step_is_made_to_have(model):
     with StandInDevice("cuda") as there:
         budget = composed("train", f"model={model}").data.sample_budget

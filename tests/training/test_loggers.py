@@ -49,12 +49,6 @@ def test_curves_are_kept_as_tables_of_each_start(trained):
     assert [row["step"] for row in rows(run.folder / "csv" / "version_1") if row["train/loss"]] == ["6"]
 
 
-def test_a_short_run_has_rows_too(trained):
-    run = trained("logger=csv")
-    steps = [row["step"] for row in rows(run.folder / "csv" / "version_0") if row["train/loss"]]
-    assert steps == ["1", "2", "3", "4"]
-
-
 @pytest.mark.parametrize("option", options("logger"))
 def test_every_logger_builds_or_names_its_extra(option):
     with pytest.raises(HydraException) if missing(option) else nullcontext() as refusal:

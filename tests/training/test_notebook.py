@@ -11,12 +11,17 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.initialize import initialize_config_dir
 from lightning import Callback, Trainer
-from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateFinder, ModelCheckpoint, ModelPruning
+from lightning.pytorch.callbacks import (
+    BatchSizeFinder,
+    GradientAccumulationScheduler,
+    LearningRateFinder,
+    ModelCheckpoint,
+    ModelPruning,
+)
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from support.captures import write_npz
 from support.configs import composed, options
-from support.learnt_cameras import LearntShifts
 from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning
@@ -205,6 +210,7 @@ def test_lightnings_look_before_training_is_no_validation(run, trainer, tmp_path
         ({"overfit_batches": 1}, ("overfit_batches=1", "scene.frames")),
         ({"gradient_clip_val": 0.5}, ("gradient_clip_val=0.5", "trainer.clip_norm=0.5")),
         ({"accumulate_grad_batches": 2}, ("accumulate_grad_batches", "data.batch_rays")),
+        ({"callbacks": [GradientAccumulationScheduler({0: 2})]}, ("GradientAccumulationScheduler", "data.batch_rays")),
         ({"callbacks": [BatchSizeFinder()]}, ("BatchSizeFinder", "data.batch_rays")),
         ({"callbacks": [LearningRateFinder()]}, ("LearningRateFinder", "optimizer.lr")),
         ({"callbacks": [ModelPruning("l1_unstructured", amount=0.1)]}, ("ModelPruning", "model=fast_small")),
@@ -224,12 +230,6 @@ def test_what_a_gpu_sums_in_any_order_is_not_called_deterministic(run, trainer, 
         refused(fit.fit, one.system, one.data, parts=("deterministic=True", "model=nerf"))
     finally:
         torch.use_deterministic_algorithms(False)
-
-
-def test_a_run_that_a_clock_ends_is_warned_of_its_learning_rate(run, trainer, caplog):
-    one = run()
-    trainer(max_steps=2, max_time={"seconds": 600}).fit(one.system, one.data)
-    assert "budget.seconds=N" in caplog.text
 
 
 @pytest.mark.parametrize("settings", [(), FAST_PATH, ("field.batch_norm=true",), ("loss=robust", "loss.patch=4")])
@@ -281,24 +281,6 @@ def test_a_run_with_a_correction_goes_on_to_the_bit(run, trainer, option):
     assert names
     loaded = RadianceFieldSystem.load_from_checkpoint(found)
     assert not [name for name in loaded.state_dict() if name.startswith("correction.")]
-
-
-def test_what_learns_beside_the_model_goes_on_too(run, trainer):
-    def with_learnt_cameras():
-        made = run("scheduler=constant")
-        cameras = made.scene.cameras, made.scene.near, made.scene.far
-        made.system.rays = made.system.train_step.objective.rays = LearntShifts(
-            *cameras, learning_rate=1e-3, weight=0.1
-        )
-        return made
-
-    whole, rest, found = whole_and_resumed(with_learnt_cameras, trainer, stop=5, steps=12)
-    assert float(whole.system.rays.shift.detach().abs().max()) > 0
-    assert_equal(rest, whole)
-    assert not [name for name in read_checkpoint(found).weights if "shift" in name]
-    goes_on, other = trainer(max_steps=12), run()
-    with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no file"):
-        goes_on.fit(other.system, other.data, ckpt_path=found)
 
 
 def test_checkpoints_of_other_runs_programs_and_strangers_are_refused(run, trainer, saved, tmp_path):

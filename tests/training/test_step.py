@@ -69,24 +69,6 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     assert train_step.progress.step == 4
 
 
-def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
-    train_step = make_step(None)
-    with torch.no_grad():
-        train_step.objective.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    gradients(train_step, ball_scene(), steps=7)
-    assert train_step.guard.in_row == 7
-    assert train_step.guard.first_module.startswith("levels.fine.field.")
-    assert first_not_finite(train_step.objective.named_weights()) == "levels.fine.field.color_head"
-
-
-def test_a_run_that_starts_from_weights_restarts_from_them():
-    train_step = make_step(None)
-    weights = {name: torch.full_like(value, 0.25) for name, value in train_step.objective.model.named_parameters()}
-    train_step.start_weights = train_step.objective.model.state_dict() | weights
-    draw_weights(train_step)
-    assert all(bool((parameter == 0.25).all()) for parameter in train_step.objective.model.parameters())
-
-
 def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     states = []
     for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:

@@ -214,12 +214,6 @@ def test_depth_is_told_in_the_users_units():
     assert int(near[0, 29].sum()) > 600 > 100 > int(far[0, 29].sum())
 
 
-def test_one_model_has_a_film_for_each_output_unchanged():
-    films = film_pictures([{"rgb": shown("rgb"), "opacity": shown("opacity")}], [""], mosaic=False)
-    assert list(films) == ["video", "opacity"]
-    assert torch.equal(films["video"], shown("rgb"))
-
-
 def test_several_models_stand_side_by_side_under_their_names():
     panels = [{"rgb": shown("rgb")}, {"rgb": shown("rgb").flip(0)}]
     film = film_pictures(panels, ["a", "b"], mosaic=False)["video"]

@@ -1,6 +1,7 @@
 """A disk that is full while TensorBoard writes: its thread says nothing, and the run ends with one paragraph."""
 
 import pytest
+from support.captures import write_npz
 from support.running import FAST, start_code
 
 # Fails from the given write, or the given flush, on, as a full disk does.
@@ -24,15 +25,9 @@ cli.main()
 """
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    from support.captures import write_npz
-
-    return write_npz(tmp_path_factory.mktemp("capture") / "small.npz")
-
-
 @pytest.mark.parametrize(("what", "first"), [("write", 12), ("flush", 2)])
-def test_is_one_paragraph(tmp_path, capture, what, first):
+def test_is_one_paragraph(tmp_path, what, first):
+    capture = write_npz(tmp_path / "small.npz")
     short = ("callbacks.monitor.every_steps=1", "trainer.max_steps=10", "final.evaluate=false", "final.video=false")
     arguments = ("train", "scene=npz", f"scene.path={capture}", *FAST, *short, f"paths.output_dir={tmp_path}/run")
     process = start_code(RUN, what, str(first), *arguments)

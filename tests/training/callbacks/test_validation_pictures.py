@@ -15,11 +15,7 @@ def a_run(scene, train_step, folder):
     model, rays = train_step.objective.model, train_step.objective.rays
     system = SimpleNamespace(model=model, rays=rays, train_step=train_step, eval=model.eval, train=model.train)
     trainer = SimpleNamespace(
-        is_global_zero=True,
-        global_step=7,
-        loggers=[],
-        default_root_dir=folder,
-        datamodule=SimpleNamespace(scene=scene),
+        is_global_zero=True, global_step=7, loggers=[], default_root_dir=folder, datamodule=SimpleNamespace(scene=scene)
     )
     return trainer, system
 

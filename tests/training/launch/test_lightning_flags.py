@@ -66,6 +66,8 @@ def test_what_lightning_would_not_take_is_refused(flags, parts):
 
 def test_no_plus_is_needed_and_no_other_run_is_meant():
     """Whatever passes through changes what is shown and measured, but not what is learned."""
+    whole, removed = "trainer.lightning={profiler: simple}", "~trainer.lightning"
+    assert open_sections([whole, removed, "trainer.lightnings=1"]) == [f"++{whole}", removed, "trainer.lightnings=1"]
     typed = open_sections(["trainer.lightning.profiler=simple", "seed=3", "+trainer.lightning.limit_val_batches=2"])
     config, _ = compose_config("train", typed)
     assert dict(config.trainer.lightning) == {"profiler": "simple", "limit_val_batches": 2}
@@ -74,8 +76,3 @@ def test_no_plus_is_needed_and_no_other_run_is_meant():
     assert run_identity(config) == run_identity(without)
     assert settings_digest(config) != settings_digest(without)  # what is left on the disk may differ
     assert isinstance(build(config.trainer), TrainerSettings)
-
-
-def test_a_section_is_opened_however_it_is_typed():
-    whole, removed = "trainer.lightning={profiler: simple}", "~trainer.lightning"
-    assert open_sections([whole, removed, "trainer.lightnings=1"]) == [f"++{whole}", removed, "trainer.lightnings=1"]

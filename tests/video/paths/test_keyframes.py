@@ -108,16 +108,6 @@ def test_seconds_count_from_any_beginning(tmp_path, dtype, closed):
     assert torch.equal(late.focal, plain.focal)
 
 
-def test_keys_close_together_on_a_long_path_are_passed(tmp_path):
-    file = keyframe_file(
-        tmp_path,
-        *(Keyframe(p, look_at=(1.0, 2.0, 3.0), time=t) for p, t in zip(PLACES, (0.0, 1e9, 1e9 + 1), strict=True)),
-    )
-    around = replace(frame(), center=MIDDLE.float(), up=UP.float(), poses=frame().poses.float())
-    cameras = KeyframePath(file, num_frames=3).cameras(around)
-    torch.testing.assert_close(cameras.c2w[[0, 2], :, 3], torch.tensor(PLACES)[[0, 2]])
-
-
 def test_times_that_are_no_seconds_make_no_endless_film(tmp_path):
     keyframes = (Keyframe((x, 0.0, 5.0), look_at=(1.0, 2.0, 3.0), time=1000 * 3600 * x) for x in (0.0, 1.0))
     file = keyframe_file(tmp_path, *keyframes)

@@ -1,13 +1,9 @@
-import inspect
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from hydra.utils import get_class
-from omegaconf import OmegaConf
 from support.budget import budget
-from support.configs import loaded, options
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, project
@@ -49,13 +45,6 @@ def test_every_camera_looks_at_the_center_and_keeps_up_up(up):
         middle = project(cameras, view, around.center)
         torch.testing.assert_close(middle, torch.tensor([50.0, 40.0], dtype=torch.float64))
         assert project(cameras, view, around.center + 0.1 * unit)[1] < 40.0
-
-
-def test_frames_are_evenly_spaced_and_the_last_is_not_the_first():
-    eyes = Orbit(num_frames=12).cameras(frame()).c2w[:, :, 3]
-    gaps = (eyes - eyes.roll(-1, dims=0)).norm(dim=-1)
-    torch.testing.assert_close(gaps, gaps[:1].expand(12))
-    assert gaps[0] > 1.0
 
 
 @pytest.mark.parametrize(
@@ -113,15 +102,6 @@ def test_a_path_leaves_the_lens_behind():
     assert cameras.lens_model == "pinhole"
     assert cameras.lens.tolist() == [[0.0] * 6] * 3
     assert cameras.focal.tolist() == [[70.0, 70.0]] * 3
-
-
-@pytest.mark.parametrize("name", options("path"))
-def test_the_yaml_lists_the_constructors_defaults(name):
-    listed = OmegaConf.to_container(loaded("path", name))
-    path = get_class(listed.pop("_target_"))
-    assert listed.pop("file", "???") == "???"
-    defaults = {name: each.default for name, each in inspect.signature(path).parameters.items()}
-    assert listed == {name: value for name, value in defaults.items() if value is not inspect.Parameter.empty}
 
 
 def ring(degrees, elevation=40.0, radius=4.0):
