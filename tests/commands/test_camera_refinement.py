@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from support.posed_captures import Known, wall, write_llff
-from support.running import FAST, FAST_PATH
+from support.running import FAST, FAST_PATH, done
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.evaluation import camera_fit
@@ -23,20 +23,17 @@ def test_a_run_says_how_far_its_cameras_moved_and_every_command_uses_them(nerf, 
 
 def refined_cameras_are_used(nerf, capture, tmp_path):
     settings = (*SETTINGS, "refinement=se3", "encoder.blend_in=0.3", f"paths.output_dir={tmp_path / 'run'}")
-    result = nerf("train", "scene=npz", f"scene.path={capture}", *settings)
-    assert result.code == 0, result.err
+    result = done(nerf("train", "scene=npz", f"scene.path={capture}", *settings))
     assert "cameras      refined: half of them moved by more than" in result.out
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["protocol"]["cameras"] == "refined"
     assert metrics["origin"]["config"]
-    result = nerf("eval", f"ckpt={checkpoint}", f"paths.output_dir={tmp_path / 'eval'}", "evaluation.max_views=2")
-    assert result.code == 0, result.err
+    done(nerf("eval", f"ckpt={checkpoint}", f"paths.output_dir={tmp_path / 'eval'}", "evaluation.max_views=2"))
     again = json.loads((tmp_path / "eval" / "metrics.json").read_text())
     assert again["protocol"] == metrics["protocol"]
     assert again["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
-    result = nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path / 'export'}")
-    assert result.code == 0, result.err
+    result = done(nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path / 'export'}"))
     assert "the cameras are the refined ones" in result.out
     record, given = read_checkpoint(checkpoint).scene, read_checkpoint(checkpoint).given_cameras
     frames = json.loads((tmp_path / "export" / "transforms.json").read_text())["frames"]

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 from support.posed_captures import Known, ring, write_colmap
-from support.running import FAST, said
+from support.running import FAST, done, said
 
 
 def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, capture, tmp_path):
@@ -15,8 +15,7 @@ def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, ca
         "train", "scene=npz", f"scene.path={tmp_path}/ball.npz", *FAST, "final.evaluate=false", "final.video=false",
         f"paths.output_dir={tmp_path}/run", "correction=exposure",
     )  # fmt: skip
-    result = nerf(*command, "trainer.max_steps=6")
-    assert result.code == 0, result.err
+    done(nerf(*command, "trainer.max_steps=6"))
     content, what = dict(np.load(capture)), "the pose of 1 of 10 photographs (3)"
     content["poses"][3, 0, 3] += 0.5
     np.savez(tmp_path / "ball.npz", **content)
@@ -37,11 +36,9 @@ def test_eval_finds_a_relative_capture_from_another_folder(nerf, tmp_path, monke
     write_colmap(home / "it's mine", Known(c2w=ring()))
     least = ("final.video=false", "logger=none", "evaluation.num_pictures=0", f"scene.cache_dir={tmp_path}/cache")
     monkeypatch.chdir(home)
-    result = nerf("train", "scene=colmap", "scene.root='it\\'s mine'", *FAST, *least, "paths.output_dir=run")
-    assert result.code == 0, result.err
+    done(nerf("train", "scene=colmap", "scene.root='it\\'s mine'", *FAST, *least, "paths.output_dir=run"))
     monkeypatch.chdir(elsewhere)
-    result = nerf("eval", "ckpt='../a home/run/checkpoints/last.ckpt'", "paths.output_dir=.", "evaluation.max_views=2")
-    assert result.code == 0, result.err
+    done(nerf("eval", "ckpt='../a home/run/checkpoints/last.ckpt'", "paths.output_dir=.", "evaluation.max_views=2"))
     trained, measured = (json.loads((folder / "metrics.json").read_text()) for folder in (home / "run", elsewhere))
     assert measured["psnr"] == trained["psnr"]
     assert measured["protocol"]["split_hash"] == trained["protocol"]["split_hash"]

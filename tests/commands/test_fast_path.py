@@ -5,7 +5,7 @@ import time
 
 import pytest
 import torch
-from support.running import FAST, FAST_PATH, finished, said, saved, start
+from support.running import FAST, FAST_PATH, finished, output_of, said, saved, start
 from support.systems import POSIX
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
@@ -39,8 +39,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
     """Weights, moments, occupancy grid, rays per step and per pixel: all of it."""
     # Several rays a pixel from step 21 on: between the two places at which it is stopped.
     shared = (f"trainer.num_threads={threads}", "model.subpixels=2", "model.subpixels_from=0.3")
-    code, output = finished(start(*arguments(capture, tmp_path / "whole", *shared)))
-    assert code == 0, output
+    output_of(start(*arguments(capture, tmp_path / "whole", *shared)))
     folder = tmp_path / "stopped"
     for how, after in ((signal.SIGKILL, 10), (signal.SIGTERM, 25)):
         process = start(*arguments(capture, folder, *shared))
@@ -49,8 +48,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
         process.send_signal(how)
         code, output = finished(process)
         assert code in (-how, 128 + how), output
-    code, output = finished(start(*arguments(capture, folder, *shared)))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, folder, *shared)))
     assert "resuming from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")
     for part in ("global_step", "state_dict", "optimizer_states"):
@@ -64,8 +62,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
 @pytest.mark.slow
 def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     long = ("trainer.max_steps=1000000", "budget.seconds=1", "scheduler.cooldown=1.0")
-    code, output = finished(start(*arguments(capture, tmp_path / "run", *long)))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, tmp_path / "run", *long)))
     content = saved(tmp_path / "run")
     assert 0 < content["global_step"] < 100_000  # a busy machine that compiles kernels on the way has few
     rate = content["optimizer_states"][0]["param_groups"][0]

@@ -6,7 +6,7 @@ import shlex
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from support.running import said
+from support.running import done, said
 
 from nerf_lightning.cli.arguments import options_first
 from nerf_lightning.config.hydra_versions import options_parser
@@ -67,8 +67,7 @@ def test_a_setting_typed_as_an_option_is_written_out(nerf, words):
 
 @pytest.mark.parametrize("command", ["eval", "render", "view", "report", "table", "train"])
 def test_every_command_shows_its_config(nerf, command):
-    result = nerf(command, "-c", "job", "--package", "paths")
-    assert result.code == 0, result.err
+    result = done(nerf(command, "-c", "job", "--package", "paths"))
     assert result.out.startswith("# @package paths\nroot_dir: outputs\n")
 
 

@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 from support.killed_runs import PLACES
-from support.running import FAST, start_code
+from support.running import FAST, output_of, start_code
 from support.systems import POSIX
 
 pytestmark = POSIX
@@ -25,9 +25,7 @@ def finish_after(plans, capture, folder):
         "trainer.val_every_steps=12", f"paths.output_dir={folder}",
     )  # fmt: skip
     script = "import runpy; runpy.run_path('tests/support/killed_runs.py', run_name='__main__')"
-    process = start_code(script, json.dumps([*plans, None]), *arguments)
-    codes, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
+    codes = output_of(start_code(script, json.dumps([*plans, None]), *arguments))
     said = (folder.parent / f"{folder.name}.txt").read_text()
     content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     return json.loads(codes), said, content

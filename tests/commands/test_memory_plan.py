@@ -6,6 +6,7 @@ import pytest
 import torch
 from support.configs import composed, options
 from support.peak_bytes import peak_bytes
+from support.running import done
 from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job import fit, memory_plan
@@ -77,8 +78,7 @@ def test_a_short_run_does_not_measure(steps, measured, train, monkeypatch):
     monkeypatch.setattr(fit, "SHORT_RUN", 2)
     monkeypatch.setattr(fit, "measured_tile", lambda *given: asked.append(8192) or (8192, None))
     short = ("trainer.tile_points=auto", f"trainer.max_steps={steps}")
-    result = train(*short, "final.evaluate=false", "final.video=false")
-    assert result.code == 0, result.err
+    done(train(*short, "final.evaluate=false", "final.video=false"))
     assert asked == measured
 
 
@@ -97,7 +97,6 @@ def test_hours_are_said_before_the_first_step(length, line, train, monkeypatch):
     monkeypatch.setattr(fit, "SHORT_RUN", 2)
     monkeypatch.setattr(fit, "measured_tile", lambda *given: (8192, 120.0))
     short = ("trainer.tile_points=auto", "final.evaluate=false", "final.video=false")
-    result = train(*length, *short, "trainer.lightning.fast_dev_run=false")
-    assert result.code == 0, result.err
+    result = done(train(*length, *short, "trainer.lightning.fast_dev_run=false"))
     assert ("time: " in result.err) == (line is not None)
     assert (line or "") in result.err

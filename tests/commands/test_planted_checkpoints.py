@@ -8,7 +8,7 @@ import yaml
 from omegaconf import OmegaConf
 from support.budget import budget
 from support.planted import Payload, compress, in_config, many_bytes, replace_pickle, write_checkpoint
-from support.running import refused, said
+from support.running import done, refused, said
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.trusted_classes import require_trusted
@@ -94,8 +94,7 @@ def test_what_lies_beside_the_model_is_not_built(nerf, tmp_path):
 
     file = write_checkpoint(tmp_path / "a.ckpt", in_config(plant))
     small = ("path.num_frames=1", "path.width=8", "format=frames", f"paths.output_dir={tmp_path}/out")
-    result = nerf("render", f"ckpt={file}", *small)
-    assert result.code == 0, result.err
+    done(nerf("render", f"ckpt={file}", *small))
     assert not mark.exists()
 
 
@@ -209,8 +208,7 @@ def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_
     scene |= {"allow_outside": True, "path": f"{tmp_path}/planted/file", "root": f"{tmp_path}/none"}
     for name in ("bricks", "lego_tiny", "colmap", "transforms", "blender"):
         file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": name}), scene=scene)
-        result = nerf("eval", f"ckpt={file}", "--cfg=job")
-        assert result.code == 0, result.err
+        result = done(nerf("eval", f"ckpt={file}", "--cfg=job"))
         (found,) = [yaml.safe_load(result.out)["scene"]]
         assert "planted" not in str(found), found
         assert found.get("allow_outside") in (None, False)

@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST_PATH, FAST_SWEEP, finished, said, saved, start, start_code, start_cold
+from support.running import FAST_PATH, FAST_SWEEP, finished, output_of, said, saved, start, start_code, start_cold
 from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
@@ -45,16 +45,14 @@ def assert_close(folder, other):
 @pytest.fixture(scope="module")
 def alone(capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone") / "run"
-    code, output = finished(start(*arguments(capture, f"paths.output_dir={folder}")))
-    assert code == 0, output
+    output_of(start(*arguments(capture, f"paths.output_dir={folder}")))
     return folder
 
 
 @pytest.mark.minutes
 def test_two_processes_follow_one(capture, tmp_path, alone):
     """Uneven shares of 101 rays, random backgrounds; views of the evaluation and frames of the film are dealt out."""
-    code, output = finished(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))
     assert_close(tmp_path, alone)
     assert output.count("test PSNR") == 1, "one process speaks"
     assert output.count("2 processes") == 1
@@ -88,8 +86,7 @@ def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path,
     code, output = finished(process)
     assert code == 128 + signal.SIGTERM, output
     assert STEPS // 2 <= saved(tmp_path)["global_step"] < STEPS
-    code, output = finished(start("train", f"resume={tmp_path}", "trainer=cpu", f"trainer.max_steps={STEPS}"))
-    assert code == 0, output
+    output_of(start("train", f"resume={tmp_path}", "trainer=cpu", f"trainer.max_steps={STEPS}"))
     assert_close(tmp_path, alone)
 
 
@@ -122,8 +119,7 @@ def test_a_worker_ends_with_the_process_that_has_started_it():
 @pytest.mark.exhaustive
 def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
     for name, extra in (("one", ()), ("two", TWO)):
-        code, output = finished(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
-        assert code == 0, output
+        output_of(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
     one, two = saved(tmp_path / "one")["nerf_lightning"], saved(tmp_path / "two")["nerf_lightning"]
     assert one["progress"] == two["progress"]
     assert one["progress"]["batch_rays"] < 256
@@ -137,8 +133,7 @@ def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_p
 def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
     quick = ("trainer.max_steps=3", "final.evaluate=false")
     sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")
-    code, output = finished(start(sweep[0], "-m", *sweep[1:]))
-    assert code == 0, output
+    output_of(start(sweep[0], "-m", *sweep[1:]))
     steps = {folder.name: saved(folder)["global_step"] for folder in tmp_path.glob("*seed=*")}
     assert steps == {"0_seed=0": 3, "1_seed=1": 3}
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from support.known_fields import INSIDE, solid
 from support.peak_bytes import peak_bytes
-from support.running import FAST, said
+from support.running import FAST, done, said
 from support.scenes import ball_scene, tiny_field
 from torch import nn
 
@@ -56,8 +56,7 @@ def rendered(nerf, tmp_path):
 
     def call(checkpoint, *arguments, name="a", frame=1):
         folder = tmp_path / name
-        result = nerf("render", f"ckpt={checkpoint}", *SMALL, "format=frames", *arguments, f"paths.output_dir={folder}")
-        assert result.code == 0, result.err
+        done(nerf("render", f"ckpt={checkpoint}", *SMALL, "format=frames", *arguments, f"paths.output_dir={folder}"))
         return {
             film: iio.imread(folder / film / f"frame_{frame:04d}.png") for film in os.listdir(folder) if film[0] != "."
         }

@@ -9,7 +9,7 @@ import time
 
 import pytest
 import torch
-from support.running import FAST, finished, saved, start
+from support.running import FAST, done, finished, output_of, saved, start
 from support.systems import POSIX
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -45,11 +45,9 @@ def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path):
     code, output = finished(process)
     assert code == 143, output
     assert f"resume with: nerf train resume={folder}" in output
-    code, output = finished(start("train", f"resume={folder}"))
-    assert code == 0, output
+    output = output_of(start("train", f"resume={folder}"))
     assert "resuming from step" in output
-    code, output = finished(start(*arguments(capture, tmp_path / "never_stopped")))
-    assert code == 0, output
+    output_of(start(*arguments(capture, tmp_path / "never_stopped")))
     torch.testing.assert_close(state(folder), state(tmp_path / "never_stopped"), rtol=0, atol=0)
     log = EventAccumulator(str(folder / "tensorboard")).Reload()
     assert [event.step for event in log.Scalars("Training loss/sum")] == list(range(5, STEPS + 1, 5))
@@ -65,8 +63,7 @@ def test_a_run_is_not_made_shorter_than_it_was_to_be(nerf, finished_run, tmp_pat
     note = json.loads((run / "run.json").read_text())
     (run / "run.json").write_text(json.dumps(note | {"num_steps": planned}))
     quick = ("final.evaluate=false", "final.video=false")
-    result = nerf("train", f"resume={run}", f"trainer.max_steps={asked}", *quick)
-    assert result.code == 0, result.err
+    result = done(nerf("train", f"resume={run}", f"trainer.max_steps={asked}", *quick))
     assert (f"continues to step {planned}, not {asked}" in result.err) == (asked < planned)
     note = json.loads((run / "run.json").read_text())
     assert (note["num_steps"], note["finished_at_step"], state(run)[0]) == (end, end, end)
@@ -174,8 +171,7 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
     assert not list(root.rglob("hpc_ckpt*")), "Lightning's own requeueing is off"
     note = json.loads((folder / "run.json").read_text())
     assert (note["slurm_job"], note["preempted"]) == ("4711", True)
-    code, output = finished(begin(capture, root, env={"SLURM_RESTART_COUNT": "1"}))
-    assert code == 0, output
+    output = output_of(begin(capture, root, env={"SLURM_RESTART_COUNT": "1"}))
     assert "resuming from step" in output
     assert len(list(root.rglob("run.json"))) == 1
     assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 70
@@ -192,8 +188,7 @@ def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path)
     run = saved_below(folder, 10, process)
     record = json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())
     os.kill(record["process"], signal.SIGUSR2)
-    code, output = finished(process)
-    assert code == 0, output
+    output_of(process)
     (log,) = folder.glob(".submitit/*/*_log.err")
     assert "resuming from step" in log.read_text()
     assert json.loads((run / "run.json").read_text())["finished_at_step"] == 70

@@ -2,7 +2,7 @@
 
 import pytest
 from support.configs import composed
-from support.running import FAST, said
+from support.running import FAST, done, said
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
@@ -27,14 +27,11 @@ def test_it_weighs_the_loss_of_each_model(model, of):
 
 
 def test_its_checkpoint_is_used_without_it(nerf, capture, tmp_path):
-    result = nerf(*arguments(capture, tmp_path / "run"))
-    assert result.code == 0, result.err
+    done(nerf(*arguments(capture, tmp_path / "run")))
     last = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    result = nerf("eval", f"ckpt={last}", "evaluation.max_views=1", f"paths.output_dir={tmp_path / 'eval'}")
-    assert result.code == 0, result.err
+    done(nerf("eval", f"ckpt={last}", "evaluation.max_views=1", f"paths.output_dir={tmp_path / 'eval'}"))
     plain = ("train", "scene=npz", f"scene.path={capture}", *FAST, "final.evaluate=false", "final.video=false")
-    result = nerf(*plain, f"init_from={last}", "trainer.max_steps=2", f"paths.output_dir={tmp_path / 'new'}")
-    assert result.code == 0, result.err
+    done(nerf(*plain, f"init_from={last}", "trainer.max_steps=2", f"paths.output_dir={tmp_path / 'new'}"))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from support.running import said
+from support.running import done, said
 
 from nerf_lightning.commands import selftest
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
@@ -18,8 +18,7 @@ def kernels_alone(monkeypatch):
 
 
 def test_a_machine_that_computes_right(nerf, kernels_alone, tmp_path):
-    result = nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out")
-    assert result.code == 0, result.err
+    result = done(nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out"))
     assert "hash grid: gradient of the table" in result.out
     assert " 0 wrong, " in result.out
     assert "processor: " in result.out

@@ -5,12 +5,14 @@ from dataclasses import asdict
 
 import pytest
 import torch
-from hydra.errors import HydraException
+from hydra.errors import HydraException, InstantiationException
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
 from support.configs import composed, loaded, options
 
+from nerf_lightning.checkpoints.trusted_classes import names_of
 from nerf_lightning.cli.main import find_commands
+from nerf_lightning.config.hydra_versions import IS_1_3, instantiate
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.budgets import Budgets
@@ -185,3 +187,19 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
         chosen = {key.partition("@")[2] for each in config.get("defaults", []) if each != "_self_" for key in each}
         named = (set(config) | chosen) - {"_target_", "_partial_", "defaults"}
         assert named == set(signature.parameters) - {"args", "kwargs"}, f"{group}/{option}"
+
+
+ENCODER = {"_target_": "nerf_lightning.nerf.encoders.frequency.FrequencyEncoder", "num_frequencies": 2}
+LINEAR = {"_target_": "torch.nn.Linear", "in_features": 1, "out_features": 2}  # defined in another module
+
+
+@pytest.mark.skipif(IS_1_3, reason="Hydra 1.3 has no whitelist")
+def test_hydra_builds_from_a_file_only_what_lies_below_trusted_names():
+    assert instantiate(ENCODER, names_of([])).out_dim == instantiate(ENCODER).out_dim
+    assert isinstance(instantiate(LINEAR, names_of(["torch.nn"])), torch.nn.Linear)
+    with pytest.raises(InstantiationException, match="whitelist"):
+        instantiate(LINEAR, names_of(["mine"]))
+
+
+def test_a_config_of_ones_own_may_name_anything():
+    assert isinstance(instantiate(LINEAR), torch.nn.Linear)

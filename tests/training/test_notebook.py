@@ -240,20 +240,6 @@ def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, se
     assert_equal(rest, whole)
 
 
-def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
-    def saves():
-        return ModelCheckpoint(every_n_train_steps=10, save_top_k=-1)
-
-    whole, rest = run(), run()
-    first = trainer(max_epochs=2, callbacks=[saves()])
-    first.fit(whole.system, whole.data)
-    found = kept(first)
-    assert found.endswith("step=10.ckpt")
-    trainer(max_epochs=2, callbacks=[saves()]).fit(rest.system, rest.data, ckpt_path=found)
-    assert rest.system.train_step.progress.step == 12
-    assert_equal(rest, whole)
-
-
 def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
     learning = (*FAST_PATH, "refinement=se3_lens", "encoder.blend_in=0.8")
     whole, rest = run(*learning), run(*learning)

@@ -1,8 +1,6 @@
 """A recorded step is the step: `tests/support/tape.py` stands for CUDA graphs, with the torch twins of the kernels."""
 
-from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -16,11 +14,9 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.losses.robust import RobustLoss
-from nerf_lightning.nerf.objective import StepOutput
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.training.attempts import restart
-from nerf_lightning.training.gradients.recorded import CudaGraphs
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 CPU = torch.device("cpu")
@@ -124,24 +120,6 @@ def test_there_is_a_recording_for_each_variant_of_a_models_steps(model, changes,
     run = trained([48] * 6, True, model, *changes)
     assert_same(run, trained([48] * 6, False, model, *changes))
     assert len(run.training.gradients.recordings) == variants
-
-
-def test_other_threads_may_pin_memory_while_a_graph_is_captured_and_graphs_share_memory(monkeypatch):
-    asked = {}
-
-    @contextmanager
-    def graph(recorded, **how):
-        asked.update(how)
-        yield
-
-    for name, stand_in in {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock}.items():
-        monkeypatch.setattr(torch.cuda, name, stand_in)
-    monkeypatch.setattr(torch.cuda, "current_stream", Mock())
-    monkeypatch.setattr(torch.cuda, "graph_pool_handle", Mock(side_effect=[(0, 1), (0, 2)]))
-    record = CudaGraphs()
-    for _ in range(2):  # batches of two sizes
-        record(lambda: Mock(spec=StepOutput))
-        assert asked == {"pool": (0, 1), "capture_error_mode": "thread_local"}
 
 
 CAPTURING = RuntimeError("CUDA error: operation not permitted when stream is capturing\nSearch")
