@@ -23,44 +23,6 @@ def test_a_config_is_composed_without_torch():
     assert output.splitlines()[-1] == "0 []"
 
 
-# What Lightning brings along of these is Lightning's; nothing of ours may ask for them before there is work for them.
-FOR_LATER = ("matplotlib", "scipy", "numba", "llvmlite", "imageio", "sympy", "triton", "torchvision")
-
-
-@pytest.mark.exhaustive
-def test_training_imports_nothing_heavy_beside_lightnings_own():
-    code = (
-        "import sys, lightning.pytorch\n"
-        "known = set(sys.modules)\n"
-        "import nerf_lightning.commands.train\n"
-        "added = {name.partition('.')[0] for name in set(sys.modules) - known}\n"
-        f"print(sorted(added.intersection({FOR_LATER})))"
-    )
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert output.splitlines()[-1] == "[]"
-
-
-LOADING = """
-import gc, sys
-from nerf_lightning.cli.process import quick_imports
-with quick_imports():
-    print(gc.isenabled())
-    import nerf_lightning.commands.train
-print([name for name in sys.modules if name.startswith("scipy.signal")])
-print(gc.isenabled(), gc.get_freeze_count() > 100_000)
-import torchmetrics, scipy.signal
-print(len(scipy.signal.convolve([1, 2], [3, 4])), sys.modules["scipy.signal"] is scipy.signal)
-"""
-
-
-@pytest.mark.minutes
-def test_the_collector_rests_while_lightning_is_loaded_and_scipys_signals_wait_for_who_asks():
-    told = subprocess.run([sys.executable, "-W", "error", "-c", LOADING], capture_output=True, text=True, check=True)
-    during, loaded, after, asked = told.stdout.splitlines()
-    assert (during, after) == ("False", "True True")
-    assert (loaded, asked, told.stderr) == ("[]", "3 True", "")
-
-
 @pytest.mark.parametrize(
     ("terminal", "arguments", "lines"),
     [(True, ["seed=1", "-m"], 1), (False, ["seed=1"], 0), (True, ["--cfg", "job"], 0)],

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 from support.captures import picture, pose
+from support.killed_runs import PLACES
 from support.running import FAST, finished, output_of, said, start, start_code
 from support.systems import POSIX
 
@@ -37,6 +39,9 @@ class Phase:
     arguments: tuple[str, ...]
     results: str = "*"
     """Files that the command writes; the others of its folder only must not be more."""
+
+    def given(self, **places):
+        return [argument.format(**places) for argument in self.arguments]
 
 
 # Each a way of writing of its own.
@@ -83,9 +88,8 @@ def places(capture, finished_run, photographs):
     return {"capture": capture, "photographs": photographs, "last": finished_run / "checkpoints" / "last.ckpt"}
 
 
-def run_as_planned(phase, plans, places, out):
-    """Run a phase's command once for each plan; return the exit codes and what was said."""
-    arguments = [argument.format(out=out, **places) for argument in phase.arguments]
+def run_as_planned(plans, arguments, out):
+    """Run a command once for each plan; return the exit codes and what was said."""
     script = "import runpy; runpy.run_path('tests/support/killed_runs.py', run_name='__main__')"
     codes = output_of(start_code(script, json.dumps(plans), *arguments, f"paths.output_dir={out}"))
     return json.loads(codes), out.with_name(f"{out.name}.txt").read_text()
@@ -111,10 +115,12 @@ def _read(file):
 @pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES)
 @POSIX
 def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(phase, places, tmp_path):
-    codes, told = run_as_planned(phase, [None], places, tmp_path / "never")
+    never, out = tmp_path / "never", tmp_path / "out"
+    codes, told = run_as_planned([None], phase.given(out=never, **places), never)
     assert codes == [0], told
-    wanted, out = content(phase, tmp_path / "never"), tmp_path / "out"
-    codes, told = run_as_planned(phase, [{"largest": phase.largest}, {"in": phase.function}, None], places, out)
+    wanted = content(phase, never)
+    plans = [{"largest": phase.largest}, {"in": phase.function}, None]
+    codes, told = run_as_planned(plans, phase.given(out=out, **places), out)
     assert codes == [2, -signal.SIGKILL, 0], told
     assert "Traceback" not in told
     (paragraph,) = [line for line in told.splitlines() if line.startswith("nerf: ")]
@@ -160,3 +166,70 @@ def test_errors_that_follow_each_other_in_a_circle_are_one_paragraph(tmp_path):
     )
     second.__context__ = InputError("The run folder is gone.")
     assert paragraph(first, "train") == "The run folder is gone."
+
+
+STEPS = 36
+# A start of such a run lasts a second or so once everything is imported.
+LONGEST = 1.2
+
+
+def finish_after(plans, capture, folder):
+    """Start, kill as planned, and start again until it ends; return the exit codes and what is left of the run."""
+    settings = (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
+        "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto", "logger=none",
+        "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
+        "trainer.val_every_steps=12",
+    )  # fmt: skip
+    codes, told = run_as_planned([*plans, None], settings, folder)
+    return codes, told, torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def moments(count):
+    """Half of them anywhere in time, half at chosen places of one of the first saves of a start."""
+    order = random.Random(time.time_ns())
+    in_time = [{"after": order.uniform(0.05, LONGEST)} for _ in range(count - count // 2)]
+    at_places = [{"in": PLACES[number % len(PLACES)], "call": order.randint(1, 6)} for number in range(count // 2)]
+    plans = in_time + at_places
+    order.shuffle(plans)
+    return plans
+
+
+@pytest.fixture(scope="module")
+def never_killed(capture, tmp_path_factory):
+    codes, told, saved = finish_after([], capture, tmp_path_factory.mktemp("never_killed") / "run")
+    assert codes == [0], told
+    return saved
+
+
+@pytest.mark.minutes
+@POSIX
+def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, never_killed):
+    plans, folder = moments(4), tmp_path / "run"
+    codes, told, saved = finish_after(plans, capture, folder)
+    story = f"{plans}\n{codes}\n{told}"
+    assert codes[-1] == 0, story
+    assert len(codes) == len(plans) + 1, story
+    assert "Traceback" not in told, story
+    assert saved["global_step"] == never_killed["global_step"] == STEPS, story
+    for key, value in never_killed["state_dict"].items():
+        assert torch.equal(saved["state_dict"][key], value), story
+    for number, moments_ in never_killed["optimizer_states"][0]["state"].items():
+        for name, value in moments_.items():
+            assert torch.equal(saved["optimizer_states"][0]["state"][number][name], value), story
+    left = {path.name for path in (folder / "checkpoints").iterdir()}
+    assert left == {"last.ckpt", "previous.ckpt", "best.ckpt"}, story
+
+
+@pytest.mark.slow
+@POSIX
+def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
+    """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""
+    folder = tmp_path / "run"
+    codes, told, saved = finish_after([{"full": 3}, {"full": 6}], capture, folder)
+    assert codes == [2, 2, 0], told
+    assert told.count("nerf: The checkpoint") == 2, told
+    assert "No space left on device" in told
+    assert f"Free some space, then continue with resume={folder}." in told
+    assert "Traceback" not in told
+    assert all(torch.equal(saved["state_dict"][key], value) for key, value in never_killed["state_dict"].items())

@@ -1,7 +1,5 @@
 """What a person adds to a run on the command line: flags of Lightning's, and callbacks of their own."""
 
-import json
-
 import pytest
 from support.running import done, said
 
@@ -71,9 +69,3 @@ def test_flags_of_lightnings_need_no_plus(train, tmp_path):
     assert "run_training_batch" in table.read_text()
     result = train("resume=auto", "trainer.max_steps=5")  # the same run, looked at in another way
     assert result.code == 0, result.err
-
-
-def test_a_fast_development_run_takes_one_step(train, tmp_path):
-    result = done(train("trainer.lightning.fast_dev_run=true", "trainer.max_steps=2000"))
-    assert "1 step, 64 rays per step" in result.err
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["finished_at_step"] == 1

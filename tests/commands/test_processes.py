@@ -128,16 +128,6 @@ def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_p
     assert two == pytest.approx(one, abs=0.2)
 
 
-@pytest.mark.slow
-@pytest.mark.exhaustive
-def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
-    quick = ("trainer.max_steps=3", "final.evaluate=false")
-    sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")
-    output_of(start(sweep[0], "-m", *sweep[1:]))
-    steps = {folder.name: saved(folder)["global_step"] for folder in tmp_path.glob("*seed=*")}
-    assert steps == {"0_seed=0": 3, "1_seed=1": 3}
-
-
 TORCHRUN = {"TORCHELASTIC_RUN_ID": "1"}
 SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
 SLURM = {f"SLURM_{name}": value for name, value in SLURM.items()}

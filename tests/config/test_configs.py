@@ -55,24 +55,6 @@ def test_every_experiment_composes_and_its_model_builds(option):
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
-PARTS = ("encoder", "encoder@direction_encoder", "field")
-SAMPLED = {"nerf": ("coarse", "fine"), "fast_proposal": ("proposal", "fine")}
-
-
-def builds_or_is_refused_in_words(*overrides):
-    """Build a model, or be told by one of its parts, in a sentence, what does not fit."""
-    config = composed("train", *overrides)
-    try:
-        reason = None if build(config.model).points_per_ray(training=True) > 0 else "no points"
-    except HydraException as error:
-        reason = error.__cause__
-    assert reason is None or (isinstance(reason, ValueError) and " " in str(reason)), overrides
-
-
-def choices(group):
-    return options(group.partition("@")[0])
-
-
 @pytest.mark.parametrize("model", options("model"))
 def test_a_model_writes_no_size_into_the_parts_that_it_chose(model):
     """Else whoever chooses another part is told of a setting that it does not have."""
@@ -120,19 +102,6 @@ def test_a_level_refuses_a_sampler_of_another_kind_in_words(model, level, sample
     with pytest.raises(HydraException) as refused:
         build(config.model)
     assert "choose another sampler, or a model with another level" in str(refused.value.__cause__)
-
-
-@pytest.mark.slow
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("model", options("model"))
-def test_every_part_of_every_model_builds_or_is_refused_in_words(model):
-    for group in PARTS:
-        for option in choices(group):
-            builds_or_is_refused_in_words(f"model={model}", f"{group}={option}")
-    for level in SAMPLED.get(model.partition("_")[0] if model not in SAMPLED else model, ("fine",)):
-        if level in composed("train", f"model={model}").model.get("levels", {}):
-            for option in options("sampler"):
-                builds_or_is_refused_in_words(f"model={model}", f"sampler@model.levels.{level}.sampler={option}")
 
 
 @pytest.mark.parametrize("option", options("scene"))

@@ -6,6 +6,7 @@ import torch
 from lightning.pytorch.trainer.states import TrainerFn, TrainerState
 from support.learnt_cameras import LearntShifts
 from support.scenes import ball_scene, tiny_model
+from support.stand_in_device import StandInDevice
 from support.steps import gradients, make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
@@ -17,7 +18,7 @@ from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.training.attempts import draw_weights, restart
 from nerf_lightning.training.gradients.tiles import Share
-from nerf_lightning.training.step_guard import first_not_finite
+from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -80,17 +81,6 @@ def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
     assert not torch.equal(states[0], states[3])
-
-
-def test_the_learning_rate_follows_the_schedule():
-    train_step = make_step(None)
-    train_step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
-    rates = []
-    loader, optimizer = RayBatches(ball_scene(), train_step.progress, 0, 16), train_step.new_optimizer()
-    for _ in range(4):
-        train_step(loader.at(0, 0), optimizer)
-        rates.append(optimizer.param_groups[0]["lr"])
-    assert rates == [0.5, 0.5, 0.25, 0.125]
 
 
 @pytest.fixture
@@ -312,3 +302,55 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
         [torch.zeros_like(each).flatten() if each.grad is None else each.grad.flatten() for each in plain.parameters()]
     )
     torch.testing.assert_close(gradients[1] - gradients[0], alone, atol=1e-4, rtol=1e-3)
+
+
+NAN, INFINITE = float("nan"), float("inf")
+GOOD = [1e-30, -0.0, -3.0]
+
+
+def parameters_with(device, *gradients):
+    for number, gradient in enumerate(gradients):
+        parameter = torch.nn.Parameter(torch.zeros(len(gradient), device=device))
+        parameter.grad = torch.zeros_like(parameter)
+        for place, value in enumerate(gradient):
+            parameter.grad[place] = value
+        yield f"part{number}.weight", parameter
+
+
+def steps_taken(guard, device):
+    """Whether each step is allowed, and the gradients that are left."""
+    for value in (1.0, NAN, -INFINITE, 1.0, INFINITE):
+        named = list(parameters_with(device, GOOD, [], [1.0, value], [value]))
+        losses = torch.full((2,), 0.5, device=device)
+        allowed = guard.allows(losses, named)
+        yield allowed, torch.cat([parameter.grad for _, parameter in named]).cpu()
+
+
+def test_on_the_cpu_steps_are_left_out_and_counted():
+    guard = StepGuard()
+    assert [allowed for allowed, _ in steps_taken(guard, torch.device("cpu"))] == [True, False, False, True, False]
+    assert guard.state() == [3, 1]
+    assert guard.first_module == "part2"
+
+
+@pytest.mark.parametrize("kind", ["cuda", "mps"])
+def test_elsewhere_their_gradients_become_zeros_and_others_keep_their_bits(kind):
+    guard = StepGuard()
+    with StandInDevice(kind) as there:
+        seen = list(steps_taken(guard, there.device))
+        assert guard.state() == [3, 1]
+        assert guard.first_module == "part2"
+    for number, (allowed, left) in enumerate(seen):
+        expected = torch.tensor([*GOOD, 1.0, 1.0, 1.0]) if number in (0, 3) else torch.zeros(6)
+        assert allowed
+        assert torch.equal(left.view(torch.int32), expected.view(torch.int32))
+
+
+@pytest.mark.parametrize("losses", [[NAN, 0.0], [0.0, INFINITE]])
+def test_a_loss_that_is_not_finite_is_the_first_where_no_gradient_shows_it(losses):
+    guard = StepGuard()
+    assert not guard.allows(torch.tensor(losses), parameters_with("cpu", GOOD))
+    assert guard.first_module == "loss"
+    assert guard.allows(torch.zeros(2), parameters_with("cpu", GOOD))
+    assert guard.allows(torch.zeros(2), parameters_with("cpu", GOOD, [1e38, -1e38]))
+    assert guard.state() == [1, 0]

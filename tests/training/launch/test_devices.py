@@ -157,13 +157,6 @@ def test_who_gains_by_bfloat16(name, native, amx, gains, monkeypatch):
     assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__() == gains
 
 
-def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch):
-    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: True)
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
-    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__()
-
-
 @pytest.mark.parametrize(("native", "used"), [(False, "32-true"), (True, "bf16-mixed")])
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
