@@ -71,5 +71,7 @@ def test_the_named_folder_itself_may_be_a_link_and_one_that_nobody_named_may_not
     checkpoint = write_checkpoint(tmp_path / "a.ckpt")
     assert nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path}/out").code == 0
     assert (tmp_path / "disk" / "sparse" / "0" / "cameras.txt").is_file()
-    (tmp_path / "export").symlink_to(tmp_path / "disk")
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    checkpoint = checkpoint.rename(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    (tmp_path / "run" / "export").symlink_to(tmp_path / "disk")
     said(nerf("export", f"ckpt={checkpoint}", "what=cameras"), "export is a symbolic link to", "paths.output_dir=DIR")

@@ -139,7 +139,6 @@ SLURM = {f"SLURM_{name}": value for name, value in SLURM.items()}
         ({}, ["trainer=torchrun"], ("trainer=torchrun: this process was not started by",)),
         ({}, ["trainer=slurm"], ("trainer=slurm: this process was not started by",)),
         (TORCHRUN, [], ("Add trainer=torchrun",)),
-        (TORCHRUN, ["trainer=torchrun", "seed=0,1", "-m"], ("each of the processes would run the sweep by itself",)),
         (SLURM, [], ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
         (SLURM, ["trainer=slurm"], ("not started by Slurm's srun",)),
         (SLURM | {"SLURM_STEP_ID": "0"}, ["trainer=slurm"], ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
@@ -152,6 +151,13 @@ def test_processes_that_would_not_train_together_are_refused(
         monkeypatch.setenv(name, value)
     said(nerf(*arguments(capture, f"paths.output_dir={tmp_path}/run", *more)), *words)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
+    result = nerf(*arguments(capture, "trainer=torchrun", "-m", "seed=0,1", f"paths.output_dir={tmp_path}"))
+    assert result.code == 2
+    assert "each of the processes would run the sweep by itself" in result.err
 
 
 def test_a_process_needs_a_device_and_the_first_failure_of_its_own_is_the_exit_code(monkeypatch):

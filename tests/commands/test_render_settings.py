@@ -107,7 +107,7 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
         (["outputs=[rgb,color]"], ["this model shows no color", "rgb, depth, opacity, normals, levels"]),
         (["mosaic=maybe"], ["mosaic=maybe", "true or false"]),
         (["format=gif"], ["format=gif", "animation (WebP"]),
-        (["background=red"], ["background=red"]),
+        (["background=red"], ["scene.background is 'red'"]),
         (["near=-1"], ["near=-1", "not negative"]),
         (["near=7"], ["near=7 leaves nothing to see", "rays end at"]),
         (["crop=[[0,0,0]]"], ["crop=[[0, 0, 0]]", "lower and the upper corner"]),

@@ -1,5 +1,6 @@
 """`nerf table`: which runs it finds, what it puts together and refuses; of strangers' runs, texts stay texts."""
 
+import csv
 import json
 import statistics
 

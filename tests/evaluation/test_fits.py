@@ -47,15 +47,12 @@ def test_what_a_mask_leaves_out_is_not_fitted_and_flat_pictures_have_no_fit_to_l
     assert torch.equal(color_corrected(render, truth, torch.zeros_like(kept)), render)
 
 
-def test_a_picture_has_both_numbers_and_fitting_never_harms():
+def test_a_picture_has_both_numbers_fitting_never_harms_and_nothing_is_fitted_to_one_of_one_colour():
     truth = picture()
     found = image_metrics(scale_light(truth, GAINS), truth)
     assert found["psnr"] < 24 < found["cc_psnr"] - 10
     same = image_metrics(truth, truth)
     assert same["psnr"] == same["cc_psnr"] == 100.0
-
-
-def test_of_a_picture_of_one_colour_nothing_is_fitted():
     truth, flat, left = picture(), torch.full((16, 20, 3), 0.3), torch.zeros(16, 20, dtype=torch.bool)
     left[:, :10] = True
     assert image_metrics(flat, truth)["cc_psnr"] is image_metrics(truth, flat + 1e-4 * truth)["cc_psnr"] is None

@@ -35,14 +35,11 @@ def sphere(rays, radius=1.0):
     return points, hit
 
 
-def test_the_share_of_escaping_light_is_taken_out_of_the_depth():
+def test_the_share_of_escaping_light_is_taken_out_of_the_depth_which_is_scored_where_the_scene_covers_the_pixel():
     opacity = torch.tensor([1.0, 0.5, 0.01, 0.0], dtype=torch.float64)
     depth = 2.5 * opacity + FAR * (1 - opacity)
     found = surface_depth(depth, opacity, torch.full_like(depth, FAR))
     torch.testing.assert_close(found, torch.tensor([2.5, 2.5, 2.5, FAR], dtype=torch.float64))
-
-
-def test_depth_is_scored_where_the_scene_covers_the_pixel():
     truth = torch.tensor([2.0, 2.0, 2.0, math.inf])
     opacity = torch.tensor([1.0, 0.5, 1.0, 0.0])
     depth = torch.tensor([2.5, 0.5 * 1.9 + 0.5 * FAR, 5.0, FAR])

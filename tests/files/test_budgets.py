@@ -19,11 +19,8 @@ def _defaults_afterwards():
     set_limits(Budgets())
 
 
-def test_the_yaml_has_the_table_that_the_code_has():
+def test_the_yaml_and_the_page_on_security_have_the_table_that_the_code_has():
     assert OmegaConf.to_container(loaded("budgets", "default")) == asdict(Budgets())
-
-
-def test_the_page_on_security_has_it_too():
     rows = re.findall(r"`(\w+)` ([\d,]+)", (REPOSITORY / "SECURITY.md").read_text(encoding="utf-8"))
     assert {name: int(number.rstrip(",").replace(",", "")) for name, number in rows} == asdict(Budgets())
 

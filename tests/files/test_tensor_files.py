@@ -33,7 +33,7 @@ def altered(path, change, compression=zipfile.ZIP_STORED):
             archive.writestr(zipfile.ZipInfo(name), data, compression)
 
 
-def test_containers_and_tensors_are_made_anew(tmp_path):
+def test_containers_and_tensors_are_made_anew_and_what_is_shared_once(tmp_path):
     shared = (0.9, 0.99)
     state = Shadowed({"a": nn.Parameter(torch.ones(2)), "b": [Shadowed({"c": shared}), shared]})
     torch.save(state, tmp_path / "a.pt")
@@ -44,9 +44,6 @@ def test_containers_and_tensors_are_made_anew(tmp_path):
     assert not content["a"].requires_grad
     assert content["b"] == [{"c": shared}, shared]
     assert type(content["b"][0]) is dict
-
-
-def test_what_is_shared_is_made_once(tmp_path):
     """Fifty lists, each of which holds the one before twice, would else be 2^50."""
     whole = []
     for _ in range(50):

@@ -45,7 +45,7 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen, counts
 
 
-def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads):
+def test_beside_each_other_they_are_those_of_one_after_the_other_and_their_bits_the_same_every_time(model, threads):
     alone, seen_alone, counts_alone = gradients_of(model, 1, threads)
     beside, seen, counts = gradients_of(model, 3, threads)
     assert float(alone.norm()) > 0
@@ -53,9 +53,6 @@ def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads)
     torch.testing.assert_close(seen.losses, seen_alone.losses)
     torch.testing.assert_close(seen.foreground, seen_alone.foreground)
     assert torch.equal(counts, counts_alone)
-
-
-def test_their_bits_are_the_same_every_time(model, threads):
     first, *_ = gradients_of(model, 3, threads)
     for _ in range(5):
         assert torch.equal(gradients_of(model, 3, threads)[0], first)

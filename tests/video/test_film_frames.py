@@ -195,7 +195,7 @@ def shown(output, normals=None):
     return panel(output, SEEN, (1.0, 3.0), 1.0, normals)
 
 
-def test_each_output_shows_what_it_says():
+def test_each_output_shows_what_it_says_and_depth_is_told_in_the_users_units():
     assert torch.equal(shown("rgb"), (RGB * 255).round().to(torch.uint8))
     assert shown("opacity")[0, 0].tolist() == [0, 0, 0]
     assert shown("opacity")[0, 29].tolist() == [255, 255, 255]
@@ -206,9 +206,6 @@ def test_each_output_shows_what_it_says():
     same = panel("levels", Picture(RGB, SEEN.depth, OPACITY, first_rgb=RGB), (1.0, 3.0), 1.0, None)
     assert len(same[:, :30].reshape(-1, 3).unique(dim=0)) == 1
     assert len(shown("levels")[:, :30].reshape(-1, 3).unique(dim=0)) > 1
-
-
-def test_depth_is_told_in_the_users_units():
     near = panel("depth", SEEN, (4.0, 6.0), 2.0, None)  # 2 scene units are 4 of the user's: as near as can be
     far = panel("depth", SEEN, (2.0, 4.0), 2.0, None)
     assert int(near[0, 29].sum()) > 600 > 100 > int(far[0, 29].sum())

@@ -68,15 +68,12 @@ def test_a_dead_run_is_restarted_and_says_so(caplog):
     assert "attempt 2 of at most 4" in caplog.text
 
 
-def test_it_gives_up_after_the_set_number(caplog):
+def test_it_gives_up_after_the_set_number_and_watches_the_end_of_the_crop_too(caplog):
     system = StubSystem(alive=lambda restarts: False)
     with caplog.at_level(logging.WARNING):
         run(CollapseGuard(max_restarts=2, until_step=300), system, 2000)
     assert system.restarts == 2
     assert "after 2 restarts" in caplog.text
-
-
-def test_the_end_of_the_crop_is_watched_too():
     """A run may die when it first sees the mostly empty whole pictures."""
     system = StubSystem(alive=lambda restarts: restarts > 0 or system.progress.step < 300)
     run(CollapseGuard(), system, 560)

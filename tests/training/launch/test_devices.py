@@ -124,15 +124,14 @@ def products_of(model):
     return {level.field.matmul_precision for level in model.levels.values()}
 
 
-def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower(slow_bfloat16):
+def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower_unless_it_was_asked_for_or_begun_with(
+    slow_bfloat16, monkeypatch
+):
     settings = TrainerSettings(accelerator="cpu")
     assert products_of(settings.prepare(fast_model())) == {"bfloat16"}
     assert products_of(settings.prepare(tiny_model())) == {"float32"}
     assert (settings.precision, "slower for layers as wide as this model's" in settings.describe()) == ("32-true", True)
     assert products_of(settings.prepare(fast_model())) == {"bfloat16"}  # whatever was prepared before
-
-
-def test_what_was_asked_for_or_begun_stays(slow_bfloat16, monkeypatch):
     assert products_of(TrainerSettings(accelerator="cpu", precision="bf16-mixed").prepare(tiny_model())) == {"bfloat16"}
     resumed = TrainerSettings(accelerator="cpu")
     resumed.keep_precision("bf16-mixed")

@@ -42,11 +42,13 @@ def test_the_curve_through_the_keyframes_of_a_path_is_the_path(path):
     torch.testing.assert_close(curve.focal(at), wanted.focal[:, 0].float())
 
 
-def test_a_circle_ends_where_it_began():
+def test_a_circle_ends_where_it_began_and_one_camera_makes_no_path(tmp_path):
     found = as_keyframes(Orbit(60, fps=12), frame())
     assert found[0].position == found[-1].position
     assert found[-1].time == pytest.approx(5.0)
     assert as_keyframes(PhotographPath(60), frame())[-1].time == pytest.approx(59 / 30)
+    assert as_keyframes(Orbit(1), frame()) == []
+    assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
 
 
 def test_keyframes_of_a_file_stay_as_they_are(tmp_path):
@@ -69,11 +71,6 @@ def test_a_file_may_leave_out_what_a_player_needs(tmp_path):
     assert found[0].position == pytest.approx(found[-1].position)
     assert found[-1].time == pytest.approx(4.0)  # 120 frames of 30 a second
     assert as_keyframes(KeyframePath(keys(tmp_path), fov=33.0), frame())[1].fov == pytest.approx(33.0, abs=1e-4)
-
-
-def test_one_camera_makes_no_path(tmp_path):
-    assert as_keyframes(Orbit(1), frame()) == []
-    assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
 
 
 def test_cameras_turn_away_step_over_the_plane_or_see_something():

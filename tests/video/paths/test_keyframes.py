@@ -137,12 +137,18 @@ def test_focal_lengths_go_from_keyframe_to_keyframe(tmp_path):
     assert KeyframePath(file, num_frames=3, fov=90.0).cameras(frame()).focal[1].tolist() == pytest.approx([50.0, 50.0])
 
 
-def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots():
+def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots_and_a_quaternion_is_its_rotations():
     knots = torch.tensor([0.0, 1.0, 1.7, 3.0, 4.5], dtype=torch.float64)
     values = (knots**2 - 3 * knots)[:, None]
     torch.testing.assert_close(hermite(knots, values, knots), values)
     at = torch.linspace(1.0, 3.0, 9, dtype=torch.float64)
     torch.testing.assert_close(hermite(knots, values, at), (at**2 - 3 * at)[:, None])
+    generator = torch.Generator().manual_seed(0)
+    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
+    half_turns = torch.eye(4, dtype=torch.float64)
+    given = torch.cat([quaternions, half_turns])
+    found = quaternion_from_rotation(rotation_from_quaternion(given))
+    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
 
 
 def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():
@@ -156,15 +162,6 @@ def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():
     steps = turned.diff().remainder(2 * math.pi)
     assert bool((steps < math.radians(25)).all())  # always forward, never the long way round
     torch.testing.assert_close(found[::10], rotations)
-
-
-def test_a_quaternion_is_its_rotations():
-    generator = torch.Generator().manual_seed(0)
-    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
-    half_turns = torch.eye(4, dtype=torch.float64)
-    given = torch.cat([quaternions, half_turns])
-    found = quaternion_from_rotation(rotation_from_quaternion(given))
-    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
 
 
 def test_times_so_uneven_that_the_field_of_view_swings_beyond_all_cameras(tmp_path):
