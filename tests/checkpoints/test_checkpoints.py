@@ -24,15 +24,12 @@ def saved(path, change=lambda cameras: None):
     return path / "last.ckpt"
 
 
-def test_a_scene_that_no_checkpoint_could_keep_is_refused_before_training():
+def test_the_lens_is_kept_and_a_scene_that_no_checkpoint_could_keep_is_refused_before_training(tmp_path):
     scene = ball_scene()
     with budget(views=2), pytest.raises(InputError, match=r"The scene has 6 views, .* add budgets.views=6"):
         make_record(scene, config="", choices={})
     with pytest.raises(InputError, match=r"cannot be kept in a checkpoint: scene.view_names names two views alike"):
         make_record(replace(scene, view_names=("a",) * 6), config="", choices={})
-
-
-def test_the_lens_is_kept_and_an_unknown_one_is_refused(tmp_path):
     cameras = read_checkpoint(saved(tmp_path)).scene.cameras
     assert cameras.lens_model == "fisheye"
     assert torch.equal(cameras.lens, torch.tensor([FISHEYE] * 6))

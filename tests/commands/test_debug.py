@@ -52,19 +52,15 @@ def test_overfit_learns_few_photographs_without_a_random_number(train, monkeypat
     refused(train, "data.overfit_views=0", parts=("data.overfit_views=0", "at least one"))
 
 
-def test_profile_ends_with_a_table(train, capsys):
-    run = train("debug=profile", "trainer.max_steps=3", "logger=none")
-    table = capsys.readouterr().out.splitlines()
+def test_the_config_is_printed_and_profile_ends_with_a_table(train, capsys):
+    run = train("print_config=true", "debug=profile", "trainer.max_steps=3", "logger=none")
+    out = capsys.readouterr().out
+    assert "_target_: nerf_lightning.nerf.models.radiance_model.RadianceModel\n" in out
+    assert re.search(r"^  batch_rays: 32$", out, re.MULTILINE)
+    assert "${" not in out
+    table = out.splitlines()
     start = next(number for number, line in enumerate(table) if line.startswith("action"))
     seconds = [float(line.split()[-1]) for line in table[start + 1 : start + 6]]
     assert seconds == sorted(seconds, reverse=True)
     assert all(len(line) <= 100 for line in table[start : start + 16])
     assert (run.folder / "fit-profile.txt").is_file()
-
-
-def test_the_config_is_printed(train, capsys):
-    train("print_config=true", "trainer.max_steps=1", "final.evaluate=false", "final.video=false", "logger=none")
-    out = capsys.readouterr().out
-    assert "_target_: nerf_lightning.nerf.models.radiance_model.RadianceModel\n" in out
-    assert re.search(r"^  batch_rays: 32$", out, re.MULTILINE)
-    assert "${" not in out

@@ -14,14 +14,11 @@ def last(finished_run):
     return finished_run / "checkpoints" / "last.ckpt"
 
 
-def test_the_checkpoint_alone_is_exported_beside_it(nerf, last, finished_run):
+def test_the_checkpoint_alone_is_exported_beside_it_or_where_it_is_said(nerf, last, finished_run, tmp_path):
     result = done(nerf("export", f"ckpt={last}", "what=cameras"))
     assert (finished_run / "export" / "transforms.json").is_file()
     assert (finished_run / "export" / "sparse" / "0" / "images.txt").is_file()
     assert str(finished_run / "export" / "transforms.json") in result.out
-
-
-def test_images_are_written_where_it_is_said(nerf, last, tmp_path):
     result = done(nerf("export", f"ckpt={last}", "what=images", "what.max_views=2", f"paths.output_dir={tmp_path}"))
     written = [line for line in result.out.strip().splitlines() if str(tmp_path) in line]
     assert written

@@ -61,12 +61,9 @@ def announced(monkeypatch, caplog, level, free):
     return caplog.messages
 
 
-def test_the_parts_of_a_bound_are_details(monkeypatch, caplog):
+def test_the_parts_of_a_bound_are_details_and_a_shortage_is_warned_of_with_what_takes_most(monkeypatch, caplog):
     assert announced(monkeypatch, caplog, logging.INFO, 10**12) == []
     assert len(announced(monkeypatch, caplog, logging.DEBUG, 10**12)) == 5
-
-
-def test_a_shortage_is_warned_of_with_what_takes_most(monkeypatch, caplog):
     (warning,) = announced(monkeypatch, caplog, logging.INFO, 10**6)
     assert "but only 0.0 GB are free, so the system may stop it" in warning
     assert "the samples of a step: lower trainer.tile_points" in warning

@@ -48,12 +48,9 @@ def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(ne
     said(nerf("render", f"ckpt={run}", "trust=no such module"), "trust=no such module", "a Python module")
 
 
-def test_the_command_that_goes_on_names_where_ones_own_yamls_lie():
+def test_the_command_that_goes_on_names_where_ones_own_yamls_lie_and_a_module_that_is_not_found_is_told(tmp_path):
     with composed_job("train", [SEARCHED, "model=voxels"]):
         assert resume_command(Path("run")) == f"nerf train resume=run {shlex.quote(SEARCHED)}"
-
-
-def test_a_module_that_python_does_not_find_is_told(tmp_path):
     elsewhere = {"_target_": "gone.VoxelModel"}
     file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda config: config.update(model=elsewhere)))
     refused(load_model, read_checkpoint(file), ["gone"], parts=("gone.VoxelModel", "PYTHONPATH=FOLDER"))

@@ -108,6 +108,7 @@ def test_the_environment_is_not_looked_up(nerf, tmp_path):
 
 BAD_YAML = {
     "aliases": "a: &a [x, x]\nb: [*a, *a]\n",
+    "merges": "- &a {x: 1}\n- &b {<<: [*a, *a]}\n",
     "depth": "model: " + "[" * 900 + "]" * 900,
     "length": "model: '" + "x" * 2_000_000 + "'",
     "python": "model: !!python/object/apply:os.system ['touch ran']",

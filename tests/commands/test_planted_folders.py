@@ -240,7 +240,7 @@ def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
     assert "Traceback" not in result.err
 
 
-def test_what_the_user_types_again_is_the_users(run):
+def test_what_the_user_types_again_is_the_users_and_the_printed_command_repeats_what_the_folder_does_not(run, tmp_path):
     leave("run", run, "scene.cache_dir=/x", "seed=1")
     assert repeated("run", run, f"resume={run}", "scene.cache_dir=/y") == ["seed=1"]
     leave("sweep", run, "hydra.sweep.subdir=mine", "scene.cache_dir=/x", "seed=0,1")
@@ -248,9 +248,6 @@ def test_what_the_user_types_again_is_the_users(run):
     assert sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={run}", *again]) == [
         "-m", "seed=0,1", "sweep.resume=true", f"hydra.sweep.dir={run}", again[1], OWN.replace(JOB, "ours/${seed}")
     ]  # fmt: skip
-
-
-def test_the_printed_command_repeats_what_the_folder_does_not(tmp_path):
     lines = ["seed=1", "scene.cache_dir=/x y", "paths.root_dir=/z", "scene.root='${oc.env:HOME}'"]
     assert to_give_again(lines) == ["'scene.cache_dir=/x y'", """'scene.root='"'"'${oc.env:HOME}'"'"''"""]
     lines = ["hydra.sweep.dir=x", "seed=0,1", "paths.root_dir=/z", "scene.cache_dir=/x y"]
@@ -259,11 +256,8 @@ def test_the_printed_command_repeats_what_the_folder_does_not(tmp_path):
 
 
 FILES = {
-    "aliases": b"a: &a [x, x]\nb: [*a, *a]\n",
     "numbers": b"[1, 2]\n",
     "objects": b"!!python/object/apply:os.system ['touch ran']\n",
-    "long": b"- x\n" * 2_000_000,
-    "binary": b"\xff\xfe\x00",
 }
 
 

@@ -1,8 +1,6 @@
 """`nerf render`: what is shown, of which checkpoints, and how it goes on after a stop."""
 
-import json
 import os
-import sys
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -17,7 +15,6 @@ from support.scenes import ball_scene, tiny_field
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.cli import main as cli
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
@@ -33,7 +30,6 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.video.film import bytes_per_pixel, film, require_room
-from nerf_lightning.video.frames import FilmFrames
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
@@ -184,37 +180,6 @@ def test_models_with_other_working_frames_show_the_same_thing(tmp_path):
         torch.testing.assert_close(one.unit * here.depth[hit], two.unit * there.depth[hit], atol=0.02, rtol=0)
         turned = one.normals(number, here)[hit] - two.normals(number, there)[hit]
         assert float(turned.abs().mean()) < 0.02
-
-
-def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
-    arguments = ["render", f"ckpt={last}", *SMALL, "path.num_frames=6"]
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert nerf(*arguments, f"paths.output_dir={whole}", "format=frames").code == 0
-    save, count = FilmFrames.save, []
-
-    def interrupted(self, film, number, picture):
-        count.append(number)
-        if len(count) == 6:
-            raise KeyboardInterrupt
-        save(self, film, number, picture)
-
-    monkeypatch.setattr(FilmFrames, "save", interrupted)
-    monkeypatch.setattr(sys, "argv", ["nerf", *arguments, f"paths.output_dir={stopped}", "format=frames"])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 130
-    monkeypatch.undo()
-    note = json.loads((stopped / ".frames" / "film.json").read_text())
-    times = {file: file.stat().st_mtime_ns for file in stopped.rglob("*.png")}
-    assert len(times) == 5
-    assert nerf(*arguments, f"paths.output_dir={stopped}", "format=frames").code == 0
-    assert json.loads((stopped / ".frames" / "film.json").read_text()) == note
-    half = stopped / "depth" / "frame_0002.png"
-    assert all(file.stat().st_mtime_ns == time for file, time in times.items() if file.name != half.name)
-    for name in ("video", "depth"):
-        for number in range(6):
-            place = f"{name}/frame_{number:04d}.png"
-            assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
 
 
 def test_panoramas_show_what_their_faces_show(last, rendered):

@@ -104,15 +104,7 @@ def saved_below(root, step, process):
     raise AssertionError(process.communicate()[0])
 
 
-def test_a_job_of_an_array_is_named_by_array_and_task(monkeypatch):
-    monkeypatch.setenv("SLURM_JOB_ID", "13")
-    assert slurm_job() == "13"
-    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "12")
-    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
-    assert slurm_job() == "12_3"
-
-
-def test_a_first_start_was_not_requeued(monkeypatch):
+def test_a_first_start_was_not_requeued_and_a_job_of_an_array_is_named_by_array_and_task(monkeypatch):
     assert not was_requeued()
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     assert not was_requeued(), "only Slurm restarts Slurm's jobs"
@@ -120,6 +112,11 @@ def test_a_first_start_was_not_requeued(monkeypatch):
     assert was_requeued()
     monkeypatch.setenv("SLURM_RESTART_COUNT", "0")
     assert not was_requeued()
+    monkeypatch.setenv("SLURM_JOB_ID", "13")
+    assert slurm_job() == "13"
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "12")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
+    assert slurm_job() == "12_3"
 
 
 @POSIX

@@ -48,10 +48,16 @@ def test_without_control_groups_or_a_limit_it_is_the_machines(own, group):
     assert free_memory() == 10_000
 
 
-def test_a_container_of_version_2_has_its_limit(own, group):
+def test_a_container_of_version_2_has_its_limit_beyond_it_nothing_and_what_cannot_be_read_is_no_limit(own, group):
     own("0::/\n")
     group("", max=1000, current=900, stat=HOLDS_FILES)
     assert free_memory() == 1000 - 900 + 150 + 50
+    own("0::/\n")
+    group("", max=1000, current=1100, stat="")
+    assert free_memory() == 0
+    own("0::/\nnonsense\n")
+    group("", max="", current="many", stat="")
+    assert free_memory() == 10_000
 
 
 @pytest.mark.parametrize("path", ["docker/1f", "not/mounted"])
@@ -68,15 +74,6 @@ def test_the_narrowest_of_the_groups_around_a_job_counts(own, group):
     group("slurm/job_7", max=2000, current=1500, stat="")
     group("slurm/job_7/step_0", max=4000, current=1500, stat="")
     assert free_memory() == 500
-
-
-def test_a_group_beyond_its_limit_has_nothing_free_and_what_cannot_be_read_is_no_limit(own, group):
-    own("0::/\n")
-    group("", max=1000, current=1100, stat="")
-    assert free_memory() == 0
-    own("0::/\nnonsense\n")
-    group("", max="", current="many", stat="")
-    assert free_memory() == 10_000
 
 
 @pytest.fixture(autouse=True)

@@ -59,12 +59,9 @@ def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path):
     assert not [each for each in overrides if "cache_dir" in each]
 
 
-def test_every_kernel_of_models_and_of_exporters_compiles():
+def test_an_exporter_is_known_by_its_yaml_and_every_kernel_of_models_and_of_exporters_compiles():
     modules = kernel_modules()
     assert "nerf_lightning.nerf.kernels.march.cpu" in modules
     assert all(backend(module) for module in modules)
-
-
-def test_an_exporter_is_known_by_its_yaml_and_one_of_somebody_else_is_not():
     assert exporter_class("images") is ImagesExport
     assert exporter_class("my_own") is None

@@ -89,7 +89,7 @@ def test_waves_of_the_depth_are_smoothed():
     assert normal_error(normals_from_depth(rough), truth, alpha) < 0.5 * normal_error(differences, truth, alpha)
 
 
-def test_beside_an_edge_a_normal_is_that_of_its_own_surface():
+def test_beside_an_edge_a_normal_is_that_of_its_own_surface_and_a_pixel_without_a_point_spoils_no_other():
     rays = picture_rays(32, focal=60.0)
     normal = normalize(torch.tensor([0.5, -0.6, 0.2], dtype=torch.float64), dim=0)
     points = plane(rays, normal)
@@ -97,9 +97,6 @@ def test_beside_an_edge_a_normal_is_that_of_its_own_surface():
     facing = normal if float(rays.directions[8, 8] @ normal) < 0 else -normal
     found = normals_from_depth(points)[:, :16]
     assert float((found * facing).sum(dim=-1).min()) > math.cos(math.radians(2.0))
-
-
-def test_a_pixel_without_a_point_spoils_no_other():
     rays = picture_rays(16, focal=200.0)
     normal = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     points = plane(rays, normal)

@@ -24,26 +24,23 @@ def row(name, **values):
     return {"name": name, "seconds": 1.0} | dict.fromkeys(METRICS) | values
 
 
-def test_a_view_without_any_number_is_null(tmp_path):
+def test_a_view_without_any_number_is_null_and_one_that_is_background_alone_keeps_the_runs_numbers(tmp_path):
     rows = [row("a", psnr=20.0, ssim=math.nan), row("b", psnr=math.inf, ssim=0.5)]
     write_metrics(tmp_path, summary(rows))
     content = strict_json(tmp_path / "metrics.json")
     assert [picture["psnr"] for picture in content["per_image"]] == [20.0, None]
     assert content["ssim"] is None
     assert content["worst"]["psnr"] == {"name": "a", "value": 20.0}
+    white, render = torch.ones(16, 16, 3), torch.full((16, 16, 3), 0.9)
+    rows = [row("empty", **image_metrics(white, white)), row("b", **image_metrics(render, white))]
+    write_metrics(tmp_path, summary(rows))
+    assert read_result(tmp_path, "run").values["psnr"] == pytest.approx(60.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_null_however_deep_it_lies(tmp_path, number):
     write_json(tmp_path / "a.json", {"a": [1, {"b": number}], "c": (number, 2.5), "d": "NaN", "e": True})
     assert strict_json(tmp_path / "a.json") == {"a": [1, {"b": None}], "c": [None, 2.5], "d": "NaN", "e": True}
-
-
-def test_a_view_that_is_background_alone_keeps_the_runs_numbers(tmp_path):
-    white, render = torch.ones(16, 16, 3), torch.full((16, 16, 3), 0.9)
-    rows = [row("empty", **image_metrics(white, white)), row("b", **image_metrics(render, white))]
-    write_metrics(tmp_path, summary(rows))
-    assert read_result(tmp_path, "run").values["psnr"] == pytest.approx(60.0, abs=1e-3)
 
 
 def view(shade):

@@ -157,13 +157,10 @@ def test_instructions_that_weights_do_not_need_are_refused(tmp_path, instruction
     refused(read_checkpoint, path, parts=("a.ckpt",))
 
 
-def test_the_format_before_1_6_says_how_to_convert(tmp_path):
+def test_lists_in_lists_without_end_are_refused_and_the_format_before_1_6_with_how_to_convert_it(tmp_path):
     """A file of it can order any memory: a storage that its list of keys omits is never held against the file."""
     torch.save({"a": torch.ones(2)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
     refused(load_tensors, tmp_path / "a.pt", parts=("before version 1.6", "torch.save(torch.load('OLD'"))
-
-
-def test_lists_in_lists_without_end_are_refused(tmp_path):
     path = write_checkpoint(tmp_path / "a.ckpt")
     for endless_pickle in (b"]" * 20_000 + b"a" * 19_999, b"]q\x00h\x00a"):
         replace_pickle(path, b"\x80\x02" + endless_pickle + b".")

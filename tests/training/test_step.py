@@ -3,7 +3,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning.pytorch.trainer.states import TrainerFn, TrainerState
 from support.learnt_cameras import LearntShifts
 from support.scenes import ball_scene, tiny_model
 from support.stand_in_device import StandInDevice
@@ -35,12 +34,9 @@ def test_a_tiled_step_equals_the_whole_step_up_to_rounding(tile_points, backgrou
     assert float(whole.norm()) > 0
 
 
-def test_clipping_scales_the_whole_gradient():
+def test_clipping_scales_the_whole_gradient_whose_norms_are_measured_before_for_each_level():
     gradient, _ = gradients(make_step(100, clip_norm=1e-3), ball_scene())
     assert abs(float(gradient.norm()) - 1e-3) < 1e-6
-
-
-def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they_are_clipped():
     clipped, whole = make_step(100, clip_norm=1e-3), make_step(100)
     scene = ball_scene()
     batch = RayBatches(scene, clipped.progress, 0, 64).at(0, 0)
@@ -107,7 +103,9 @@ def stingy_model(room):
     return model, tried
 
 
-def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thread):
+def test_without_memory_the_tile_is_halved_and_the_step_repeated_and_for_a_single_ray_the_run_ends_with_advice(
+    caplog, one_thread
+):
     scene = ball_scene()
     wanted, losses = gradients(make_step(100_000), scene)
     model, tried = stingy_model(room=20)
@@ -117,9 +115,6 @@ def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thr
     assert tried[0] == 64
     assert tried[-1] <= 20
     assert "out of memory: reducing tiles to" in caplog.text
-
-
-def test_without_memory_for_a_single_ray_the_run_ends_with_advice():
     with pytest.raises(InputError, match="There is no memory"):
         gradients(make_step(100_000, model=stingy_model(room=0)[0]), ball_scene())
 
@@ -189,24 +184,6 @@ def test_weights_that_are_not_finite_are_not_saved():
         system.model.levels["fine"].field.color_head.bias[0] = float("inf")
     with pytest.raises(InputError, match=r"weights of step 7 are not finite.*optimizer\.lr"):
         system.on_save_checkpoint({})
-
-
-def test_validation_has_no_jitter():
-    system = RadianceFieldSystem(make_step(None), {})
-    logged = {}
-    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
-    fits = {"state": TrainerState(fn=TrainerFn.FITTING), "loggers": [logger], "global_step": 3}
-    system._trainer = type("T", (), {"sanity_checking": False} | fits)()
-    system.log_dict = lambda values, **options: None
-    loader = RayBatches(ball_scene(), system.train_step.progress, 0, 64)
-    values = []
-    for _ in range(2):
-        with torch.no_grad():
-            system.validation_step(loader.at(0, 0), 0)
-            system.on_validation_epoch_end()
-        values.append(dict(logged))
-    assert values[0] == values[1]
-    assert values[0]["val/psnr_standard_error"] > 0
 
 
 def a_step_with_shifts(tile_points=None, model=None, **settings):

@@ -77,9 +77,12 @@ def test_the_run_stops_and_says_step_module_and_last_good_checkpoint(tmp_path):
     assert last(tmp_path)["global_step"] == 10
 
 
-def test_without_a_checkpoint_it_says_so(tmp_path):
+def test_without_a_checkpoint_it_says_so_and_settings_that_make_no_sense_are_refused(tmp_path):
     with pytest.raises(InputError, match="No checkpoint was saved yet: begin anew with a smaller"):
         run(tmp_path, NanGuard(patience=4), step=2)
+    for settings, words in (({"factor": 1.5}, "nan_guard.factor=1.5"), ({"patience": 0}, "patience=0")):
+        with pytest.raises(InputError, match=words):
+            NanGuard(**settings)
 
 
 def test_a_few_bad_steps_are_left_out_and_no_more(tmp_path, caplog):
@@ -172,9 +175,3 @@ def test_weights_that_are_not_finite_are_noticed_and_never_saved(tmp_path, caplo
     assert "The weights of step 14 are not finite numbers (first those of levels.coarse.field" in caplog.text
     assert first_not_finite(system.train_step.objective.named_weights()) is None
     assert system.train_step.progress.rollbacks == 1
-
-
-def test_settings_that_make_no_sense_are_refused():
-    for settings, words in (({"factor": 1.5}, "nan_guard.factor=1.5"), ({"patience": 0}, "patience=0")):
-        with pytest.raises(InputError, match=words):
-            NanGuard(**settings)

@@ -181,7 +181,7 @@ def test_a_missing_torch_xla_is_named_with_the_way_to_install_it_and_a_missing_t
         TrainerSettings(accelerator="tpu")
 
 
-def test_settings_and_models_that_do_not_fit_are_refused(tpu):
+def test_on_a_tpu_one_process_multiplies_in_bfloat16_and_settings_and_models_that_do_not_fit_are_refused(tpu):
     with pytest.raises(InputError, match=r"trainer\.compile=true.*XLA compiles"):
         TrainerSettings(accelerator="tpu", compile=True)
     with pytest.raises(InputError, match=r"launched_by=torchrun.*one process drives all cores"):
@@ -190,9 +190,6 @@ def test_settings_and_models_that_do_not_fit_are_refused(tpu):
         xla.require_static_shapes(model())
     with pytest.raises(InputError, match="model=fast_dense"):
         xla.require_static_shapes(fast_model(RaggedLevel))
-
-
-def test_one_process_multiplies_in_bfloat16_and_tries_no_tiles(tpu):
     settings = TrainerSettings(accelerator="tpu", devices=8)
     assert (settings.device_type, settings.precision, settings.measures_tile) == ("xla", "bf16-mixed", False)
     assert choose_precision("32-true", "xla")[0] == "32-true"

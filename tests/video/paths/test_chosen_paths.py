@@ -88,16 +88,13 @@ def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
         torch.testing.assert_close(found.focal, wanted.focal)
 
 
-def test_a_path_passes_the_photographs_as_they_were_taken():
+def test_a_path_passes_the_photographs_as_they_were_taken_and_is_smooth_where_it_closes():
     chosen = frame().poses[[0, 3, 4]]
     cameras = PhotographPath(2001, views=[0, "IMG_03*", 4]).cameras(frame())
     for pose in chosen:
         apart = (cameras.c2w - pose).abs().amax(dim=(-2, -1))
         assert float(apart.min()) < 5e-3
     torch.testing.assert_close(cameras.c2w[[0, -1]], chosen[[0, -1]])
-
-
-def test_a_closed_path_is_smooth_where_it_closes():
     eyes = PhotographPath(400, closed=True).cameras(frame()).c2w[:, :, 3]
     velocity = eyes.roll(-1, dims=0) - eyes
     change = (velocity.roll(-1, dims=0) - velocity).norm(dim=-1)
