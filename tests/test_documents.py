@@ -107,7 +107,8 @@ def test_the_example_of_the_readme_trains_loads_and_renders(tmp_path):
 
 def test_the_example_of_cameras_in_memory_trains_and_resumes_to_the_bit(tmp_path):
     (example,) = [block for block in blocks("docs/python.md") if "from_cameras" in block]
-    assert ran(example, tmp_path, ("steps(20)", "steps(4)"), ("== 10", "== 2"))[-1] == "4 True"
+    example = example.replace("steps(20)", "steps(4)")
+    assert ran(example, tmp_path, ("== 10", "== 2"))[-1] == "4 True"
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/extending.md"])

@@ -68,13 +68,18 @@ def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
     def full(handle):
         raise OSError(28, "No space left on device")
 
+    (tmp_path / "other").mkdir()
+    last = tmp_path / "other" / "checkpoints" / "last.ckpt"
+    write_checkpoint({"step": 1}, last)
     (tmp_path / "run").write_text("a file")
     with pytest.raises(InputError, match=r"run/checkpoints is writable, then continue with resume="):
         write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
     monkeypatch.setattr(os, "fsync", full)
-    (tmp_path / "other").mkdir()
-    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then continue with resume="):
-        write_checkpoint({"a": 1}, tmp_path / "other" / "checkpoints" / "last.ckpt")
+    with pytest.raises(
+        InputError, match=r"No space left on device.*last\.ckpt is intact\. Free some space, then continue"
+    ):
+        write_checkpoint({"step": 2}, last)
+    assert steps(last.parent) == {"last.ckpt": 1}
 
 
 def test_a_run_folder_that_is_gone_does_not_come_back(tmp_path):

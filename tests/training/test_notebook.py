@@ -238,6 +238,8 @@ def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, se
     assert found.endswith("step=12.ckpt")
     assert rest.system.train_step.progress.step == 24
     assert_equal(rest, whole)
+    if "loss=robust" in settings:
+        assert 0 < float(whole.system.state_dict()["loss.threshold"]) < 1
 
 
 def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
