@@ -23,13 +23,13 @@ from nerf_lightning.nerf.models.render_image import render_rays as render_rays
 from nerf_lightning.nerf.randomness import batch_random as batch_random
 from nerf_lightning.nerf.randomness import fold as fold
 from nerf_lightning.nerf.rendering.quadrature import composite as composite
+from nerf_lightning.nerf.rendering.quadrature import composite_ragged as composite_ragged
 from nerf_lightning.nerf.rendering.quadrature import weights_from_density as weights_from_density
-from nerf_lightning.nerf.rendering.ragged import composite_ragged as composite_ragged
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler as ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler as OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler as ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler as StratifiedSampler
-from nerf_lightning.nerf.types.points import Points as Points
+from nerf_lightning.nerf.types.rays import Points as Points
 from nerf_lightning.nerf.types.rays import RaggedSamples as RaggedSamples
 from nerf_lightning.nerf.types.rays import RayBundle as RayBundle
 from nerf_lightning.nerf.types.rays import RaySamples as RaySamples
