@@ -25,7 +25,7 @@ from support.configs import composed, options
 from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning
-from nerf_lightning import RadianceFieldSystem, RayDataModule, build_run
+from nerf_lightning import RadianceFieldSystem, build_run
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.config.instantiate import build
@@ -120,7 +120,7 @@ def test_what_the_package_offers_is_loaded_when_it_is_asked_for():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
     assert {"RadianceFieldSystem", "RayDataModule", "build_run", "__version__"} <= set(dir(nerf_lightning))
-    assert RayDataModule.__name__ == "RayDataModule"
+    assert all(hasattr(package, name) for package in (nerf_lightning, nerf_lightning.nerf) for name in dir(package))
     with pytest.raises(AttributeError, match="no attribute 'build_runs'"):
         _ = nerf_lightning.build_runs
 
