@@ -20,7 +20,7 @@ def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkey
     assert all(summary for summary in find_commands().values())
 
 
-def test_json_is_refused_where_no_table_is_printed_and_settings_that_readers_share_are_no_scene_and_no_command(nerf):
+def test_json_is_refused_without_a_table_and_what_readers_share_is_no_scene_and_no_command(nerf):
     said(nerf("train", "--json"), "nerf train prints no table", "doctor, table, selftest and bench")
     assert "There is no command 'capture'" in nerf("capture").err
     refused = nerf("train", "scene=capture").err

@@ -48,7 +48,7 @@ def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(ne
     said(nerf("render", f"ckpt={run}", "trust=no such module"), "trust=no such module", "a Python module")
 
 
-def test_the_command_that_goes_on_names_where_ones_own_yamls_lie_and_a_module_that_is_not_found_is_told(tmp_path):
+def test_where_ones_own_yamls_and_modules_lie_is_said_or_asked_for(tmp_path):
     with composed_job("train", [SEARCHED, "model=voxels"]):
         assert resume_command(Path("run")) == f"nerf train resume=run {shlex.quote(SEARCHED)}"
     elsewhere = {"_target_": "gone.VoxelModel"}

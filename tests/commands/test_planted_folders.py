@@ -240,7 +240,7 @@ def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
     assert "Traceback" not in result.err
 
 
-def test_what_the_user_types_again_is_the_users_and_the_printed_command_repeats_what_the_folder_does_not(run, tmp_path):
+def test_what_the_user_types_again_is_the_users_and_the_printed_command_asks_for_it(run, tmp_path):
     leave("run", run, "scene.cache_dir=/x", "seed=1")
     assert repeated("run", run, f"resume={run}", "scene.cache_dir=/y") == ["seed=1"]
     leave("sweep", run, "hydra.sweep.subdir=mine", "scene.cache_dir=/x", "seed=0,1")

@@ -25,6 +25,8 @@ def test_a_machine_that_computes_right(nerf, kernels_alone, tmp_path):
     written = json.loads((tmp_path / "out" / "selftest.json").read_text())
     assert written["right"] is True
     assert {row["outcome"] for row in written["checks"]} == {"ok"}
+    # One that is far above what rounding does would let mistakes through.
+    assert max(row["bound"] for row in written["checks"]) <= 0.25
     assert {"torch", "numba", "cpu_flags", "threads", "nerf_lightning"} <= set(written["machine"])
 
 

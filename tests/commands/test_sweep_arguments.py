@@ -21,7 +21,7 @@ def test_the_flag_comes_first_wherever_it_was_typed_and_a_single_run_stays_as_it
     assert sweep_arguments(["seed=0", "paths.output_dir=out"]) == ["seed=0", "paths.output_dir=out"]
 
 
-def test_what_candidates_of_hydra_cannot_remove_and_slurm_without_srun_are_refused_before_a_folder_is_made(monkeypatch):
+def test_what_cannot_be_started_is_refused_before_a_folder_is_made(monkeypatch):
     asked = ["-m", "seed=0,1", "~callbacks.monitor"]
     monkeypatch.setattr(hydra_versions, "SWEEPS_REMOVE", True)
     assert "~callbacks.monitor" in sweep_arguments(asked)

@@ -168,7 +168,7 @@ def test_without_depths_pixels_are_as_wide_as_at_the_middle_of_the_scene(caplog,
     assert said in caplog.text
 
 
-def test_a_loss_and_a_grid_that_are_typed_or_whose_depths_are_not_known_stay_and_none_is_beyond_reason():
+def test_a_loss_and_a_grid_stay_where_they_are_typed_or_no_depths_are_known():
     for scene, typed in (
         (PHOTOGRAPHS, ()),
         (with_depths(IN_A_BOX), ()),

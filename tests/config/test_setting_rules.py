@@ -61,7 +61,7 @@ def test_no_entry_stands_twice_and_each_is_of_a_key():
     assert {key for key in entries if not key.startswith("hydra.")} - used - unseen == set()
 
 
-def test_every_setting_is_in_a_group_that_is_decided_about_and_files_may_choose_from_a_group_or_decidedly_not():
+def test_every_setting_and_every_group_is_decided_about():
     settings = {key for key in flatten(composed("train")) if not names_a_class(key)}
     assert [key for key in settings if row_of(key) is None] == []
     others = {"hydra", "logger", "output", "budgets", "viewer", "what"}
@@ -91,7 +91,7 @@ def texts_in(annotation):
     return [annotation]
 
 
-def test_a_new_reader_part_or_callback_has_the_row_of_its_group_and_of_the_name_of_a_class_nothing_is_taken():
+def test_what_is_new_has_the_row_of_its_group_and_of_the_name_of_a_class_nothing_is_taken():
     assert meaning_of("scene.of_a_new_reader").trust is Trust.PLAIN
     assert meaning_of("scene.of_a_new_reader").learnt
     for key in ("field.of_a_new_field", "loss.terms.of_a_new_loss", "callbacks.mine.port", "trainer.unheard_of"):

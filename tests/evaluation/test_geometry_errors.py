@@ -35,7 +35,7 @@ def sphere(rays, radius=1.0):
     return points, hit
 
 
-def test_the_share_of_escaping_light_is_taken_out_of_the_depth_which_is_scored_where_the_scene_covers_the_pixel():
+def test_depth_is_scored_without_escaping_light_and_where_the_scene_covers_the_pixel():
     opacity = torch.tensor([1.0, 0.5, 0.01, 0.0], dtype=torch.float64)
     depth = 2.5 * opacity + FAR * (1 - opacity)
     found = surface_depth(depth, opacity, torch.full_like(depth, FAR))
@@ -89,7 +89,7 @@ def test_waves_of_the_depth_are_smoothed():
     assert normal_error(normals_from_depth(rough), truth, alpha) < 0.5 * normal_error(differences, truth, alpha)
 
 
-def test_beside_an_edge_a_normal_is_that_of_its_own_surface_and_a_pixel_without_a_point_spoils_no_other():
+def test_normals_are_their_own_surfaces_beside_an_edge_and_beside_a_pixel_without_a_point():
     rays = picture_rays(32, focal=60.0)
     normal = normalize(torch.tensor([0.5, -0.6, 0.2], dtype=torch.float64), dim=0)
     points = plane(rays, normal)

@@ -1,4 +1,7 @@
-"""The stand-in for a device is believed because it refuses what a device would, and says which line asked."""
+"""The stand-in for a device is believed because it refuses what a device would, and says which line asked.
+
+What it must not refuse, the models do (tests/training/test_every_model_on_stand_in.py).
+"""
 
 import re
 
@@ -44,18 +47,6 @@ REFUSED_IN_STEPS = {
         lambda there, host: torch.zeros(3, dtype=torch.float64, device=there.device),
     ],
 }
-TAKEN = [
-    lambda there, host: there * 2.0 + torch.tensor(3.0),
-    lambda there, host: torch.zeros_like(host, device=there.device) + there,
-    lambda there, host: there.new_zeros(3) + torch.arange(3, device=there.device) + there.new_full((3,), 2.0),
-    lambda there, host: host.pin_memory().to(there.device, non_blocking=True) + there,
-    lambda there, host: there.repeat_interleave(there.long(), output_size=6),
-    lambda there, host: torch.nonzero_static(there, size=3),
-    lambda there, host: there.__setitem__(there > 0, 0.0),
-    lambda there, host: there.__setitem__(slice(2), 1.0),
-    lambda there, host: there[:2] + there[torch.arange(2, device=there.device)],
-    lambda there, host: [*host.tolist(), float(host.sum()), host.numpy()],
-]
 
 
 def flat(cases):
@@ -94,14 +85,6 @@ def test_a_device_without_float64_refuses_it_always(case):
         case(*both(device))
     with StandInDevice("mps") as device, pytest.raises(Refused, match="float64"):
         torch.ones(2, dtype=torch.float64).to(device.device)
-
-
-@pytest.mark.parametrize("case", TAKEN)
-def test_what_a_step_may_do_is_done(case, there):
-    there_and_host = both(there)
-    with there.in_step():
-        case(*there_and_host)
-    assert not there.waited
 
 
 def test_tensors_say_where_they_lie(there):

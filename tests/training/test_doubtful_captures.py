@@ -23,9 +23,7 @@ def of_npz(caplog, tmp_path, images):
     return warnings(caplog, "scene=npz", f"scene.path={path}")
 
 
-def test_photographs_of_one_colour_show_nothing_a_few_are_named_and_sound_ones_are_trained_on_without_a_word(
-    caplog, tmp_path
-):
+def test_photographs_of_one_colour_show_nothing_and_a_few_are_named(caplog, tmp_path):
     assert of_npz(caplog, tmp_path, npz_content()["images"]) == []
     images = npz_content()["images"]
     for level, told in ((0, "8 of 8 training photographs of npz show nothing: 0 (all 0, 0, 0)"), (1, "8 of 8")):

@@ -103,9 +103,7 @@ def stingy_model(room):
     return model, tried
 
 
-def test_without_memory_the_tile_is_halved_and_the_step_repeated_and_for_a_single_ray_the_run_ends_with_advice(
-    caplog, one_thread
-):
+def test_without_memory_tiles_are_halved_until_a_single_ray_does_not_fit(caplog, one_thread):
     scene = ball_scene()
     wanted, losses = gradients(make_step(100_000), scene)
     model, tried = stingy_model(room=20)
@@ -129,14 +127,6 @@ def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(capl
     assert tried[:3] == [144, 72, 36]
     assert max(tried[3:]) == 36
     assert caplog.text.count("from now on") == 2
-
-
-def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(monkeypatch):
-    model, compiled = tiny_model(), []
-    monkeypatch.setattr(torch.nn.Module, "compile", lambda module, **options: compiled.append((module, options)))
-    model.levels["coarse"].field.compiles = False
-    assert model.compile_fields() == ["fine"]
-    assert compiled == [(model.levels["fine"].field, {"dynamic": False})]
 
 
 def robust_step(tile_points, patch=4):

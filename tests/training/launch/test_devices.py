@@ -124,9 +124,7 @@ def products_of(model):
     return {level.field.matmul_precision for level in model.levels.values()}
 
 
-def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower_unless_it_was_asked_for_or_begun_with(
-    slow_bfloat16, monkeypatch
-):
+def test_wide_layers_take_float32_where_bfloat16_is_slower_unless_it_was_asked_for_or_begun(slow_bfloat16, monkeypatch):
     settings = TrainerSettings(accelerator="cpu")
     assert products_of(settings.prepare(fast_model())) == {"bfloat16"}
     assert products_of(settings.prepare(tiny_model())) == {"float32"}
@@ -181,7 +179,7 @@ def test_a_missing_torch_xla_is_named_with_the_way_to_install_it_and_a_missing_t
         TrainerSettings(accelerator="tpu")
 
 
-def test_on_a_tpu_one_process_multiplies_in_bfloat16_and_settings_and_models_that_do_not_fit_are_refused(tpu):
+def test_a_tpu_takes_one_process_in_bfloat16_and_refuses_what_does_not_fit(tpu):
     with pytest.raises(InputError, match=r"trainer\.compile=true.*XLA compiles"):
         TrainerSettings(accelerator="tpu", compile=True)
     with pytest.raises(InputError, match=r"launched_by=torchrun.*one process drives all cores"):

@@ -73,7 +73,7 @@ def test_a_file_may_leave_out_what_a_player_needs(tmp_path):
     assert as_keyframes(KeyframePath(keys(tmp_path), fov=33.0), frame())[1].fov == pytest.approx(33.0, abs=1e-4)
 
 
-def test_of_a_forward_facing_capture_its_path_can_be_filmed_and_not_what_turns_away_or_steps_over_the_plane(tmp_path):
+def test_a_forward_facing_capture_can_be_filmed_from_before_its_near_plane(tmp_path):
     # 90 degrees of view: turned by 40 its border still looks ahead, by 50 no longer.
     c2w = torch.eye(4)[:3].repeat(4, 1, 1)
     for view, degrees in enumerate((0.0, 40.0, 50.0)):

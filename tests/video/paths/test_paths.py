@@ -140,7 +140,7 @@ def test_a_sweep_is_level_and_as_high_and_as_far_as_the_photographs_nearby():
     assert step.max() < 1.2
 
 
-def test_a_sweep_stays_where_most_photographs_are_comes_no_nearer_than_a_tenth_of_them_and_leaves_wide_gaps():
+def test_a_sweep_stays_where_most_photographs_are_and_no_nearer_than_a_tenth_of_them():
     around = frame(poses=torch.cat([ring(range(0, 60, 3)), ring([30.0], 40.0, 0.5)]))
     offsets = Sweep(smooth=5.0).cameras(around).c2w[:, :, 3] - around.center
     assert offsets.norm(dim=-1).min() >= 4.0 - 1e-9

@@ -109,7 +109,7 @@ def test_a_camera_whose_picture_has_no_top_is_refused_and_without_its_first_keyf
     assert filled.curve() is None
 
 
-def test_many_that_save_at_once_lose_nothing_no_link_is_written_through_and_a_failure_gives_its_name_back(tmp_path):
+def test_new_files_take_no_name_twice_follow_no_link_and_give_their_name_back_on_failure(tmp_path):
     (tmp_path / "a_002.txt").symlink_to(tmp_path / "elsewhere")
 
     def save(number):
