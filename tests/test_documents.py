@@ -50,6 +50,18 @@ def test_documents_are_short():
     assert {document.name: count for document, count in words.items() if count > 1500} == {}
 
 
+def ran(code, folder, *replaced):
+    """Run an example with a small scene and short runs, or it would take minutes; return what it printed."""
+    for given, instead in replaced:
+        assert code.count(given) == 1
+        code = code.replace(given, instead)
+    process = start_code(code, cwd=folder)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert "Warning" not in errors
+    return output.splitlines()
+
+
 def test_the_example_runs_without_hydra_and_lightning():
     (example, *_) = [block for block in blocks("docs/python.md") if "RadianceModel" in block]
     check = "\nimport sys\nprint([m for m in ('hydra', 'lightning', 'omegaconf') if m in sys.modules])\n"
@@ -62,24 +74,13 @@ def test_the_example_runs_without_hydra_and_lightning():
 
 def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
     (example,) = [block for block in blocks("docs/python.md") if "Trainer(" in block]
-    # A small scene and short runs, or it would take minutes.
     capture = write_npz(tmp_path / "capture.npz")
     small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
-    for given, instead in (
-        ('"scene=bricks"', small),
-        ("max_steps=500", "max_steps=3"),
-        ("max_steps=1000", "max_steps=5"),
-    ):
-        assert example.count(given) == 1
-        example = example.replace(given, instead)
+    shorter = ('"scene=bricks"', small), ("max_steps=500", "max_steps=3"), ("max_steps=1000", "max_steps=5")
     check = "\nprint(run.system.train_step.progress.step, system.train_step.progress.step)\n"
-    process = start_code(example + check, cwd=tmp_path)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    *_, shapes, steps = output.splitlines()
+    *_, shapes, steps = ran(example + check, tmp_path, *shorter)
     assert shapes == "torch.Size([4, 6, 3]) torch.Size([4, 6])"
     assert steps == "5 0"
-    assert "Warning" not in errors
     assert list((tmp_path / "outputs" / "notebook").rglob("*.ckpt"))
 
 
@@ -87,17 +88,13 @@ def test_the_example_of_the_surface_reads_trains_loads_and_renders(tmp_path):
     (example,) = [block for block in blocks("docs/python.md") if "nl.train" in block]
     capture = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
     small = ", ".join(f'"{each}"' for each in (*FAST, "final.video=false"))
-    for given, instead in (
+    smaller = (
         ('"data/fox", downscale=2', f'"{capture}"'),
         ("data/fox", str(capture)),
         ('"scene.downscale=2", "trainer.max_steps=800"', small),
-    ):
-        assert example.count(given) == 1
-        example = example.replace(given, instead)
-    process = start_code(example.replace("num_frames=2)", "num_frames=2, width=4)"), cwd=tmp_path)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert output.splitlines()[-1] == "torch.Size([8, 8, 3]) torch.Size([8, 8]) torch.Size([8, 8])"
+        ("num_frames=2)", "num_frames=2, width=4)"),
+    )
+    assert ran(example, tmp_path, *smaller)[-1] == "torch.Size([8, 8, 3]) torch.Size([8, 8]) torch.Size([8, 8])"
 
 
 def test_the_example_of_the_readme_trains_loads_and_renders(tmp_path):
@@ -105,19 +102,14 @@ def test_the_example_of_the_readme_trains_loads_and_renders(tmp_path):
     capture = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
     small = ", ".join(f'"{each}"' for each in (*FAST, "scene=blender", f"scene.root={capture}", "final.video=false"))
     given = '"scene=bricks", "model=fast_small", "trainer.max_steps=300"'
-    assert example.count(given) == 1
-    process = start_code(example.replace(given, small).replace("num_frames=8", "num_frames=2, width=4"), cwd=tmp_path)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert output.splitlines()[-1].startswith("torch.Size([")
+    smaller = (given, small), ("num_frames=8", "num_frames=2, width=4")
+    assert ran(example, tmp_path, *smaller)[-1].startswith("torch.Size([")
 
 
 def test_the_example_of_cameras_in_memory_trains_and_resumes_to_the_bit(tmp_path):
     (example,) = [block for block in blocks("docs/python.md") if "from_cameras" in block]
-    process = start_code(example.replace("steps(20)", "steps(4)").replace("== 10", "== 2"), cwd=tmp_path)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert output.splitlines()[-1] == "4 True"
+    example = example.replace("steps(20)", "steps(4)")
+    assert ran(example, tmp_path, ("== 10", "== 2"))[-1] == "4 True"
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/extending.md"])
@@ -348,10 +340,7 @@ def what_prints(cells, folder):
     code = "\n\n".join(cells)
     for given, instead in SMALLER:
         code = re.sub(given, instead, code)
-    process = start_code(f"{code}\n", cwd=folder)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors[-3000:]
-    return output
+    return "\n".join(ran(f"{code}\n", folder))
 
 
 def with_wrong_solutions(cells):

@@ -1,15 +1,15 @@
-"""The wheel is enough: conf/ travels inside the package."""
+"""The wheel is enough: conf/ travels inside the package; `make help` shows what there is to do."""
 
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tarfile
 import zipfile
-from pathlib import Path
 
 import pytest
-
-REPOSITORY = Path(__file__).parents[1]
+from support.running import REPOSITORY
 
 
 def python(*arguments, cwd, **env):
@@ -50,3 +50,16 @@ def test_a_wheel_installed_elsewhere_gives_a_working_nerf(tmp_path):
     assert "nerf prune ckpt=RUN" in python("-m", "nerf_lightning", "prune", "--help", **elsewhere)
     assert "scene.images=null" in python("-m", "nerf_lightning", "help", "scene=colmap", **elsewhere)
     assert "complete -c nerf" in python("-m", "nerf_lightning", "completion", "fish", **elsewhere)
+
+
+MAKEFILE = REPOSITORY / "Makefile"
+TARGETS = re.findall(r"^([a-z-]+):.*## (.*)$", MAKEFILE.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_help_lists_every_target_in_two_columns():
+    shown = subprocess.run(
+        ["make", "--no-print-directory", "help"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout
+    assert shown.splitlines() == [f"{name:<20}{text}" for name, text in TARGETS]
+    assert len(TARGETS) > 20

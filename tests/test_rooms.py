@@ -89,31 +89,8 @@ def test_a_circle_is_found():
     assert circle({("a", "b"): set(), ("b", "c"): set(), ("c", "b"): set(), ("c", "d"): set()}) == ["a", "b", "c"]
 
 
-def code_lines(file: Path) -> int:
-    """Lines that are neither blank nor comments, docstrings or imports."""
-    text, left_out = file.read_text(encoding="utf-8"), set()
-    for node in ast.walk(ast.parse(text)):
-        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        if documented and ast.get_docstring(node) is not None:
-            left_out |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            left_out |= set(range(node.lineno, node.end_lineno + 1))
-    lines = enumerate(text.splitlines(), start=1)
-    return sum(bool(line.strip()) and not line.strip().startswith("#") and at not in left_out for at, line in lines)
-
-
-def counted(found: list[Path]) -> str:
-    lines = sum(len(file.read_text(encoding="utf-8").splitlines()) for file in found)
-    return f"{len(found)} files, {lines:,} lines, {sum(map(code_lines, found)):,} of code"
-
-
 if __name__ == "__main__":
     all_rooms, all_arrows = drawn()
     for (a, b), why in sorted(all_arrows.items()):
         print(f"{a} -> {b}: {len(why)}")
-    python = [file for file in files() if file.suffix == ".py"]
-    for room in sorted(all_rooms):
-        print(f"{room:16} {counted([file for file in python if room_of(file) == room])}")
-    print(f"the core         {counted([file for file in python if room_of(file) != 'extensions'])}")
-    print(f"tests            {counted(sorted(Path(__file__).parent.rglob('*.py')))}")
     print(f"{len(all_rooms)} rooms, {len(all_arrows)} arrows, circle: {circle(all_arrows) or 'none'}")

@@ -20,10 +20,7 @@ from nerf_lightning.checkpoints.format import FILE
 
 KEPT = Path(__file__).parent / "kept"
 NERF = (
-    "encoder.num_frequencies=3",
-    "direction_encoder.num_frequencies=1",
-    "field.width=8",
-    "field.depth=2",
+    *("encoder.num_frequencies=3", "direction_encoder.num_frequencies=1", "field.width=8", "field.depth=2"),
     "field.skip=1",
 )
 HASH = ("encoder.num_levels=2", "encoder.log2_table_size=5", "encoder.max_resolution=32", "field.width=8")
@@ -39,10 +36,7 @@ KINDS = {
         f"{PROPOSAL}.position_encoder.log2_table_size=5",
     ),
     "view_transformer": (
-        "model=view_transformer_tiny",
-        "model.width=8",
-        "model.image_width=4",
-        "model.image_features=4",
+        *("model=view_transformer_tiny", "model.width=8", "model.image_width=4", "model.image_features=4"),
     ),
 }
 SMALL = ("trainer=cpu", "trainer.precision=32-true", "data.batch_rays=64", "data.crop_steps=0")

@@ -1,14 +1,12 @@
 """What a run loads before its first step: nothing heavy that it does not need, the rest without a pause."""
 
-import gc
 import subprocess
 import sys
 
 import pytest
-from support.cold_import import cold_import
 
 from nerf_lightning.cli import prepare
-from nerf_lightning.cli.process import announce_start, quick_imports
+from nerf_lightning.cli.process import announce_start
 from nerf_lightning.config.scene_overrides import UnknownScene
 
 
@@ -23,39 +21,6 @@ def test_a_config_is_composed_without_torch():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "0 []"
-
-
-# What Lightning brings along of these is Lightning's; nothing of ours may ask for them before there is work for them.
-FOR_LATER = ("matplotlib", "scipy", "numba", "llvmlite", "imageio", "sympy", "triton", "torchvision")
-
-
-@pytest.mark.exhaustive
-def test_training_imports_nothing_heavy_beside_lightnings_own():
-    code = (
-        "import sys, lightning.pytorch\n"
-        "known = set(sys.modules)\n"
-        "import nerf_lightning.commands.train\n"
-        "added = {name.partition('.')[0] for name in set(sys.modules) - known}\n"
-        f"print(sorted(added.intersection({FOR_LATER})))"
-    )
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert output.splitlines()[-1] == "[]"
-
-
-@pytest.mark.minutes
-def test_the_collector_rests_while_lightning_is_loaded_and_scipys_signals_wait_for_who_asks(tmp_path_factory):
-    during, loaded, after, *_, asked = cold_import(tmp_path_factory)
-    assert (during, after) == ("False", "True True")
-    assert (loaded, asked) == ("[]", "3 True")
-
-
-def test_later_jobs_of_a_sweep_leave_nothing_behind():
-    import lightning  # noqa: F401
-
-    before = gc.get_freeze_count()
-    with quick_imports():
-        assert gc.isenabled()
-    assert gc.get_freeze_count() <= before
 
 
 @pytest.mark.parametrize(

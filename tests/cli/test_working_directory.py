@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from support.captures import write_npz
-from support.running import FAST, REPOSITORY, start_cold
+from support.running import FAST, REPOSITORY, output_of, start_cold
 
 from nerf_lightning.cli import process
 
@@ -31,12 +31,6 @@ def strange_folder(tmp_path):
         (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'a').write('{name} ')\n")
     yield folder
     assert not (tmp_path / "mark").exists(), (tmp_path / "mark").read_text()
-
-
-def output_of(process):
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    return output
 
 
 def test_a_process_started_with_m_imports_nothing_from_it(strange_folder):

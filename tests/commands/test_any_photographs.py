@@ -3,7 +3,7 @@
 import pytest
 from PIL import Image, ImageOps
 from support.captures import real_capture
-from support.running import finished, start
+from support.running import output_of, start
 
 QUICK = {"kermit": "", "sacre_coeur": "", "cup_colmap": "images", "fern": "images_8"}
 SLOW = {"lund_street": "", "banana_photos": "", "sceaux_photos": "images", "fox": "images"}
@@ -35,6 +35,5 @@ def test_photographs_without_cameras_become_a_film(tmp_path, name, folder):
             small.thumbnail((LONGER_SIDE, LONGER_SIDE))
             small.save(root / f"{path.stem}.jpg", quality=95, exif=exif)
     where = f"scene.root={root}", f"scene.cache_dir={tmp_path / 'cache'}", f"paths.output_dir={output}"
-    code, said = finished(start("train", "scene=photos", *where, *FEW_STEPS))
-    assert code == 0, said
+    output_of(start("train", "scene=photos", *where, *FEW_STEPS))
     assert (output / "video.mp4").stat().st_size > 0

@@ -4,69 +4,41 @@ import json
 import shutil
 
 import numpy as np
-import pytest
 from support.posed_captures import Known, ring, write_colmap
-from support.running import FAST
-
-WHAT = {
-    "poses": "the pose of 1 of 10 photographs (3)",
-    "focal": "the focal length of 10 of 10 photographs",
-    "images": "the pixels of 1 of 10 photographs (3)",
-}
+from support.running import FAST, done, said
 
 
-def changed(path, key):
-    content = dict(np.load(path))
-    if key == "poses":
-        content["poses"][3, 0, 3] += 0.5
-    elif key == "focal":
-        content["focal"] = content["focal"] * 1.25
-    else:
-        content["images"][3, 5, 5] = 1 - content["images"][3, 5, 5]
-    np.savez(path, **content)
-
-
-@pytest.fixture
-def begun(nerf, capture, tmp_path):
-    """A run of 6 steps on a capture of its own, and the command that goes on with it."""
+def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, capture, tmp_path):
+    """What is named of each change: tests/checkpoints/test_same_capture.py."""
     shutil.copy(capture, tmp_path / "ball.npz")
     command = (
         "train", "scene=npz", f"scene.path={tmp_path}/ball.npz", *FAST, "final.evaluate=false", "final.video=false",
         f"paths.output_dir={tmp_path}/run", "correction=exposure",
     )  # fmt: skip
-    result = nerf(*command, "trainer.max_steps=6")
-    assert result.code == 0, result.err
-    return (*command, "trainer.max_steps=12", "resume=auto")
-
-
-def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, capture, begun, tmp_path):
-    for key, what in WHAT.items():
-        shutil.copy(capture, tmp_path / "ball.npz")
-        changed(tmp_path / "ball.npz", key)
-        result = nerf(*begun)
-        assert result.code == 2, result.err
-        assert what in result.err.strip().splitlines()[-1]
-        assert "resume_changed_capture=true" in result.err.strip().splitlines()[-1]
-    result = nerf(*begun, "resume_changed_capture=true")  # the refusals have left the run as it was
+    done(nerf(*command, "trainer.max_steps=6"))
+    content, what = dict(np.load(capture)), "the pose of 1 of 10 photographs (3)"
+    content["poses"][3, 0, 3] += 0.5
+    np.savez(tmp_path / "ball.npz", **content)
+    again = (*command, "trainer.max_steps=12", "resume=auto")
+    result = nerf(*again)
+    assert result.code == 2, result.err
+    assert what in result.err.splitlines()[-1]
+    assert "resume_changed_capture=true" in result.err.splitlines()[-1]
+    result = nerf(*again, "resume_changed_capture=true")  # the refusal has left the run as it was
     assert result.code == 0, result.err
     assert what in result.out + result.err
     assert "resuming from step 6" in result.out + result.err
-
-
-LEAST = ("final.video=false", "logger=none", "evaluation.num_pictures=0")
 
 
 def test_eval_finds_a_relative_capture_from_another_folder(nerf, tmp_path, monkeypatch):
     home, elsewhere = tmp_path / "a home", tmp_path / "elsewhere"
     elsewhere.mkdir()
     write_colmap(home / "it's mine", Known(c2w=ring()))
-    kept = f"scene.cache_dir={tmp_path}/cache"
+    least = ("final.video=false", "logger=none", "evaluation.num_pictures=0", f"scene.cache_dir={tmp_path}/cache")
     monkeypatch.chdir(home)
-    result = nerf("train", "scene=colmap", "scene.root='it\\'s mine'", kept, *FAST, *LEAST, "paths.output_dir=run")
-    assert result.code == 0, result.err
+    done(nerf("train", "scene=colmap", "scene.root='it\\'s mine'", *FAST, *least, "paths.output_dir=run"))
     monkeypatch.chdir(elsewhere)
-    result = nerf("eval", "ckpt='../a home/run/checkpoints/last.ckpt'", "paths.output_dir=.", "evaluation.max_views=2")
-    assert result.code == 0, result.err
+    done(nerf("eval", "ckpt='../a home/run/checkpoints/last.ckpt'", "paths.output_dir=.", "evaluation.max_views=2"))
     trained, measured = (json.loads((folder / "metrics.json").read_text()) for folder in (home / "run", elsewhere))
     assert measured["psnr"] == trained["psnr"]
     assert measured["protocol"]["split_hash"] == trained["protocol"]["split_hash"]
@@ -75,5 +47,4 @@ def test_eval_finds_a_relative_capture_from_another_folder(nerf, tmp_path, monke
 def test_what_is_nowhere_is_named_as_it_was_given(nerf, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = nerf("train", "scene=colmap", "scene.root=absent", "paths.output_dir=run")
-    assert result.code == 2
-    assert f"The folder absent does not exist in {tmp_path}, where relative ones are looked for" in result.err
+    said(result, f"The folder absent does not exist in {tmp_path}, where relative ones are looked for")

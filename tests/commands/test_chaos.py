@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 from support.captures import picture, pose
-from support.running import FAST, said, saved, start, start_code
+from support.killed_runs import PLACES
+from support.running import FAST, finished, output_of, said, start, start_code
 from support.systems import POSIX
 
 from nerf_lightning.config.error_messages import paragraph
@@ -30,42 +32,43 @@ QUIET = (
 
 @dataclass(frozen=True)
 class Phase:
-    """A command, the function whose run is the phase, and what is looked at afterwards."""
+    """A command, the function where a kill hits it amid a file, and a size (bytes) that its files exceed."""
 
     function: str
+    largest: int
     arguments: tuple[str, ...]
     results: str = "*"
     """Files that the command writes; the others of its folder only must not be more."""
+
+    def given(self, **places):
+        return [argument.format(**places) for argument in self.arguments]
 
 
 # Each a way of writing of its own.
 PHASES = {
     "evaluating": Phase(
-        "nerf_lightning.evaluation.evaluator:Scoring.score",
+        "PIL.Image:Image.save",
+        2500,
         ("eval", "ckpt={last}", "scene=npz", "scene.path={capture}", "trainer.num_threads=1"),
     ),
     "filming": Phase(
-        "nerf_lightning.video.frames:FilmFrames.open",
+        "nerf_lightning.video.encoding:_counted",
+        1000,
         ("render", "ckpt={last}", "path.num_frames=4", "trainer.num_threads=1"),
     ),
     "exporting images": Phase(
-        "nerf_lightning.export.images:ImagesExport.export",
+        "nerf_lightning.export.images:write_json",
+        1000,
         ("export", "ckpt={last}", "what=images", "what.max_views=3", "trainer.num_threads=1"),
     ),
     "decoding": Phase(
-        "nerf_lightning.data.pixels.mapped_store:_make",
+        "nerf_lightning.data.pixels.mapped_store:_spots",
+        2500,
         ("train", "scene=transforms", "scene.root={photographs}", "scene.cache_dir={out}/cache", *FAST, *QUIET,
          "trainer.max_steps=1", "resume=auto"),
         "cache/*",
     ),
 }  # fmt: skip
-# Where a kill hits a phase amid a file, and a size (bytes) that its files exceed.
-QUICK = {
-    "evaluating": ("PIL.Image:Image.save", 2500),
-    "filming": ("nerf_lightning.video.encoding:_counted", 1000),
-    "exporting images": ("nerf_lightning.export.images:write_json", 1000),
-    "decoding": ("nerf_lightning.data.pixels.mapped_store:_spots", 2500),
-}
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +88,10 @@ def places(capture, finished_run, photographs):
     return {"capture": capture, "photographs": photographs, "last": finished_run / "checkpoints" / "last.ckpt"}
 
 
-def run_as_planned(phase, plans, places, out):
-    """Run a phase's command once for each plan; return the exit codes and what was said."""
-    arguments = [argument.format(out=out, **places) for argument in phase.arguments]
+def run_as_planned(plans, arguments, out):
+    """Run a command once for each plan; return the exit codes and what was said."""
     script = "import runpy; runpy.run_path('tests/support/killed_runs.py', run_name='__main__')"
-    process = start_code(script, json.dumps(plans), *arguments, f"paths.output_dir={out}")
-    codes, errors = process.communicate(timeout=600)
-    assert process.returncode == 0, errors
+    codes = output_of(start_code(script, json.dumps(plans), *arguments, f"paths.output_dir={out}"))
     return json.loads(codes), out.with_name(f"{out.name}.txt").read_text()
 
 
@@ -111,21 +111,17 @@ def _read(file):
     return None if with_times else hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def never_killed(phase, places, out):
-    """Return what a command writes that nothing befalls, and the seconds from the beginning of the phase to the end."""
-    codes, told = run_as_planned(phase, [{"phase": phase.function}], places, out)
-    assert codes == [0], told
-    return content(phase, out), float(out.with_name(f"{out.name}.seconds").read_text())
-
-
 @pytest.mark.minutes
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES)
 @POSIX
-def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(name, places, tmp_path):
-    phase, out, (amid, largest) = PHASES[name], tmp_path / "out", QUICK[name]
-    wanted, _ = never_killed(phase, places, tmp_path / "never")
-    codes, told = run_as_planned(phase, [{"largest": largest}, {"phase": amid, "after": 0}, None], places, out)
-    assert codes == [2, -signal.SIGALRM, 0], told
+def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(phase, places, tmp_path):
+    never, out = tmp_path / "never", tmp_path / "out"
+    codes, told = run_as_planned([None], phase.given(out=never, **places), never)
+    assert codes == [0], told
+    wanted = content(phase, never)
+    plans = [{"largest": phase.largest}, {"in": phase.function}, None]
+    codes, told = run_as_planned(plans, phase.given(out=out, **places), out)
+    assert codes == [2, -signal.SIGKILL, 0], told
     assert "Traceback" not in told
     (paragraph,) = [line for line in told.splitlines() if line.startswith("nerf: ")]
     assert str(out) in paragraph
@@ -133,70 +129,22 @@ def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given
     assert content(phase, out) == wanted, told
 
 
-@pytest.mark.slow
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", PHASES)
+@pytest.mark.minutes
 @POSIX
-def test_a_command_that_is_killed_at_50_moments_ends_the_same(name, places, tmp_path):
-    phase, killed = PHASES[name], 0
-    wanted, seconds = never_killed(phase, places, tmp_path / "never")
-    for number in range(500):
-        # Training follows, where the phase is an early one: more of the moments lie at the beginning.
-        out, after = tmp_path / f"killed_{number}", seconds * random.random() ** 3
-        codes, told = run_as_planned(phase, [{"phase": phase.function, "after": after}, None], places, out)
-        story = f"{after:.6f} s into the phase\n{told}"
-        assert codes[0] in (0, -signal.SIGALRM), story
-        assert codes[1] == 0, story
-        assert "Traceback" not in told, story
-        assert content(phase, out) == wanted, story
-        killed += codes[0] != 0
-        if killed == 50:
-            return
-    pytest.fail(f"only {killed} of 500 planned kills came before the end")
-
-
-def train(capture, folder, steps, *more):
-    return start(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.num_threads=1", "final.evaluate=false",
-        "final.video=false", "callbacks.validation_pictures.every_steps=7", "resume=auto",
-        f"trainer.max_steps={steps}", f"paths.output_dir={folder}", *more,
+def test_a_run_whose_folder_is_renamed_stops(capture, tmp_path):
+    process = start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.num_threads=1", "trainer.max_steps=2000",
+        "callbacks.validation_pictures.every_steps=7", f"paths.output_dir={tmp_path / 'run'}",
     )  # fmt: skip
-
-
-def ended(process):
-    output, _ = process.communicate(timeout=300)
-    assert "Traceback" not in output, output
-    return process.returncode, output
-
-
-def once_saved(process, folder):
-    """Wait until a run has saved, and a random while more."""
-    while process.poll() is None and not (folder / "checkpoints" / "last.ckpt").exists():
+    while process.poll() is None and not (tmp_path / "run" / "checkpoints" / "last.ckpt").exists():
         time.sleep(0.01)
     time.sleep(random.uniform(0, 0.2))
-
-
-@pytest.mark.minutes
-@pytest.mark.parametrize("logger", ["tensorboard", pytest.param("none", marks=pytest.mark.exhaustive)])
-@POSIX
-def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, tmp_path):
-    process = train(capture, tmp_path / "run", 2000, f"logger={logger}")
-    once_saved(process, tmp_path / "run")
     os.rename(tmp_path / "run", tmp_path / "moved")
-    code, output = ended(process)
-    assert code == 2, output
+    code, output = finished(process)
+    assert (code, "Traceback" in output) == (2, False), output
     (paragraph,) = [line for line in output.splitlines() if line.startswith("nerf: ")]
     assert f"{tmp_path / 'run'} was deleted, moved or renamed during the run" in paragraph
     assert not (tmp_path / "run" / "run.json").exists()
-    moved = tmp_path / "moved"
-    step = saved(moved)["global_step"]
-    process = train(capture, moved, 2000, f"logger={logger}")
-    while process.poll() is None and saved(moved)["global_step"] == step:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGTERM)
-    code, output = ended(process)
-    assert code == 128 + signal.SIGTERM, output
-    assert f"resuming from step {step}" in output
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="needs a place where nobody can write")
@@ -218,3 +166,70 @@ def test_errors_that_follow_each_other_in_a_circle_are_one_paragraph(tmp_path):
     )
     second.__context__ = InputError("The run folder is gone.")
     assert paragraph(first, "train") == "The run folder is gone."
+
+
+STEPS = 36
+# A start of such a run lasts a second or so once everything is imported.
+LONGEST = 1.2
+
+
+def finish_after(plans, capture, folder):
+    """Start, kill as planned, and start again until it ends; return the exit codes and what is left of the run."""
+    settings = (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
+        "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto", "logger=none",
+        "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
+        "trainer.val_every_steps=12",
+    )  # fmt: skip
+    codes, told = run_as_planned([*plans, None], settings, folder)
+    return codes, told, torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def moments(count):
+    """Half of them anywhere in time, half at chosen places of one of the first saves of a start."""
+    order = random.Random(time.time_ns())
+    in_time = [{"after": order.uniform(0.05, LONGEST)} for _ in range(count - count // 2)]
+    at_places = [{"in": PLACES[number % len(PLACES)], "call": order.randint(1, 6)} for number in range(count // 2)]
+    plans = in_time + at_places
+    order.shuffle(plans)
+    return plans
+
+
+@pytest.fixture(scope="module")
+def never_killed(capture, tmp_path_factory):
+    codes, told, saved = finish_after([], capture, tmp_path_factory.mktemp("never_killed") / "run")
+    assert codes == [0], told
+    return saved
+
+
+@pytest.mark.minutes
+@POSIX
+def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, never_killed):
+    plans, folder = moments(4), tmp_path / "run"
+    codes, told, saved = finish_after(plans, capture, folder)
+    story = f"{plans}\n{codes}\n{told}"
+    assert codes[-1] == 0, story
+    assert len(codes) == len(plans) + 1, story
+    assert "Traceback" not in told, story
+    assert saved["global_step"] == never_killed["global_step"] == STEPS, story
+    for key, value in never_killed["state_dict"].items():
+        assert torch.equal(saved["state_dict"][key], value), story
+    for number, moments_ in never_killed["optimizer_states"][0]["state"].items():
+        for name, value in moments_.items():
+            assert torch.equal(saved["optimizer_states"][0]["state"][number][name], value), story
+    left = {path.name for path in (folder / "checkpoints").iterdir()}
+    assert left == {"last.ckpt", "previous.ckpt", "best.ckpt"}, story
+
+
+@pytest.mark.slow
+@POSIX
+def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
+    """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""
+    folder = tmp_path / "run"
+    codes, told, saved = finish_after([{"full": 3}, {"full": 6}], capture, folder)
+    assert codes == [2, 2, 0], told
+    assert told.count("nerf: The checkpoint") == 2, told
+    assert "No space left on device" in told
+    assert f"Free some space, then continue with resume={folder}." in told
+    assert "Traceback" not in told
+    assert all(torch.equal(saved["state_dict"][key], value) for key, value in never_killed["state_dict"].items())

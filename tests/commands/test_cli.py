@@ -1,13 +1,10 @@
 import os
-import sys
 
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 from support.configs import yaml_files
 from support.running import said
 
-from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.hydra_versions import IS_1_3
 
@@ -23,11 +20,8 @@ def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkey
     assert all(summary for summary in find_commands().values())
 
 
-def test_json_is_refused_where_no_table_is_printed(nerf):
+def test_json_is_refused_without_a_table_and_what_readers_share_is_no_scene_and_no_command(nerf):
     said(nerf("train", "--json"), "nerf train prints no table", "doctor, table, selftest and bench")
-
-
-def test_the_settings_that_readers_share_are_no_scene_and_no_command(nerf):
     assert "There is no command 'capture'" in nerf("capture").err
     refused = nerf("train", "scene=capture").err
     assert "There is no scene=capture." in refused
@@ -42,37 +36,7 @@ def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
     assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]
 
 
-of_1_3 = pytest.mark.skipif(
-    not IS_1_3, reason="Hydra 1.4 looks for the mode in the command line and the main yaml only"
-)
-
-
-@pytest.fixture
-def compositions(monkeypatch):
-    """How often Hydra composed a config."""
-    times, load = [], ConfigLoaderImpl.load_configuration
-
-    def counted(*given, **named):
-        times.append(1)
-        return load(*given, **named)
-
-    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
-    return times
-
-
-@of_1_3
-@pytest.mark.parametrize(("more", "times"), [((), 1), (("hydra.mode=RUN",), 2), (("--config-dir={}",), 2)])
-def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_users(
-    compositions, tmp_path, monkeypatch, capsys, more, times
-):
-    arguments = ["table", f"paths.output_dir={tmp_path}", f"runs=[{tmp_path}]", *more]
-    monkeypatch.setattr(sys, "argv", ["nerf", *(each.format(tmp_path) for each in arguments)])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert len(compositions) == times, capsys.readouterr()
-
-
-@of_1_3
+@pytest.mark.skipif(not IS_1_3, reason="Hydra 1.4 looks for the mode in the command line and the main yaml only")
 def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "many.yaml").write_text("# @package _global_\nhydra:\n  mode: MULTIRUN\n")
@@ -81,12 +45,8 @@ def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
 
 
 def test_mistyped_options_and_commands_have_near_matches(nerf):
-    result = nerf("train", "--hlep")
-    assert result.code == 2
-    assert "Did you mean --help?" in result.err
-    result = nerf("trian")
-    assert result.code == 2
-    assert "Did you mean train?" in result.err
+    said(nerf("train", "--hlep"), "Did you mean --help?")
+    said(nerf("trian"), "Did you mean train?")
 
 
 @pytest.mark.parametrize(
@@ -104,12 +64,9 @@ def test_mistyped_options_and_commands_have_near_matches(nerf):
 )
 def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
     result = nerf("train", override)
-    assert result.code == 2
-    assert override.partition("=")[0].rpartition(".")[2] in result.err
+    said(result, override.partition("=")[0].rpartition(".")[2])
     assert f"Did you mean {hint}" in result.err or f"={hint}" in result.err
     assert "search path" not in result.err
-    assert "Traceback" not in result.err
-    assert len(result.err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize(("command", "key"), [("render", "ckpt"), ("eval", "ckpt"), ("report", "run")])
@@ -126,10 +83,7 @@ def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypa
 
 
 def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf):
-    assert (
-        "optimizer.fused is a setting of optimizer=adam, which is not chosen."
-        in nerf("train", "optimizer.fused=true").err
-    )
+    said(nerf("train", "optimizer.fused=true"), "optimizer.fused is a setting of optimizer=adam, which is not chosen.")
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
     said(nerf("selftest", "experiment=quickstart"), "nerf selftest has no setting experiment. It belongs to training")
     said(nerf("train", "+experiment=quickstart"), "leave out the +. Type experiment=quickstart.")
@@ -137,10 +91,5 @@ def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf)
     said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")
     said(nerf("train", "scene.downscale=2"), "scene=bricks is rendered, in the size scene.resolution=N")
     assert "+zzzz=VALUE adds one of your own" in nerf("render", "zzzz=1").err
-    result = nerf("train", "scene=blender")
-    assert result.code == 2
-    assert "nerf train needs scene.root: add scene.root=VALUE." in result.err
-    result = nerf("train", "model=nerf", "field.skip=20")
-    assert result.code == 2
-    assert "skip=20 names no layer" in result.err
-    assert "Traceback" not in result.err
+    said(nerf("train", "scene=blender"), "nerf train needs scene.root: add scene.root=VALUE.")
+    said(nerf("train", "model=nerf", "field.skip=20"), "skip=20 names no layer")

@@ -3,7 +3,6 @@
 import re
 
 import pytest
-import torch
 from support.captures import write_npz
 from support.configs import composed
 from support.running import refused
@@ -50,31 +49,18 @@ def test_overfit_learns_few_photographs_without_a_random_number(train, monkeypat
     assert set(made.data.batches.at(0, 0).pixels.view.tolist()) <= set(splits["train"])
     assert made.data.scene.splits["train"] == made.data.scene.splits["val"] != splits["val"]
     assert len(made.data.scene.splits["train"]) == 2
-
-
-def test_every_step_of_overfit_sees_the_same_samples_and_no_photograph_is_none_to_overfit(tmp_path, train):
-    capture = write_npz(tmp_path / "capture.npz")
-    made = nl.build_run("scene=npz", f"scene.path={capture}", *SMALL, "data.overfit_views=2", "data.crop_steps=0")
-    train_step, batch = made.system.train_step, made.data.batches.at(0, 0)
-    first = train_step.gradients(batch, train_step.key).rgb
-    train_step.progress.step = 7
-    assert torch.equal(train_step.gradients(batch, train_step.key).rgb, first)
     refused(train, "data.overfit_views=0", parts=("data.overfit_views=0", "at least one"))
 
 
-def test_profile_ends_with_a_table(train, capsys):
-    run = train("debug=profile", "trainer.max_steps=3", "logger=none")
-    table = capsys.readouterr().out.splitlines()
+def test_the_config_is_printed_and_profile_ends_with_a_table(train, capsys):
+    run = train("print_config=true", "debug=profile", "trainer.max_steps=3", "logger=none")
+    out = capsys.readouterr().out
+    assert "_target_: nerf_lightning.nerf.models.radiance_model.RadianceModel\n" in out
+    assert re.search(r"^  batch_rays: 32$", out, re.MULTILINE)
+    assert "${" not in out
+    table = out.splitlines()
     start = next(number for number, line in enumerate(table) if line.startswith("action"))
     seconds = [float(line.split()[-1]) for line in table[start + 1 : start + 6]]
     assert seconds == sorted(seconds, reverse=True)
     assert all(len(line) <= 100 for line in table[start : start + 16])
     assert (run.folder / "fit-profile.txt").is_file()
-
-
-def test_the_config_is_printed(train, capsys):
-    train("print_config=true", "trainer.max_steps=1", "final.evaluate=false", "final.video=false", "logger=none")
-    out = capsys.readouterr().out
-    assert "_target_: nerf_lightning.nerf.models.radiance_model.RadianceModel\n" in out
-    assert re.search(r"^  batch_rays: 32$", out, re.MULTILINE)
-    assert "${" not in out

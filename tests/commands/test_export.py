@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import extensions
-from support.running import said
+from support.running import done, said
 
 
 @pytest.fixture(scope="module")
@@ -14,17 +14,12 @@ def last(finished_run):
     return finished_run / "checkpoints" / "last.ckpt"
 
 
-def test_the_checkpoint_alone_is_exported_beside_it(nerf, last, finished_run):
-    result = nerf("export", f"ckpt={last}", "what=cameras")
-    assert result.code == 0, result.err
+def test_the_checkpoint_alone_is_exported_beside_it_or_where_it_is_said(nerf, last, finished_run, tmp_path):
+    result = done(nerf("export", f"ckpt={last}", "what=cameras"))
     assert (finished_run / "export" / "transforms.json").is_file()
     assert (finished_run / "export" / "sparse" / "0" / "images.txt").is_file()
     assert str(finished_run / "export" / "transforms.json") in result.out
-
-
-def test_images_are_written_where_it_is_said(nerf, last, tmp_path):
-    result = nerf("export", f"ckpt={last}", "what=images", "what.max_views=2", f"paths.output_dir={tmp_path}")
-    assert result.code == 0, result.err
+    result = done(nerf("export", f"ckpt={last}", "what=images", "what.max_views=2", f"paths.output_dir={tmp_path}"))
     written = [line for line in result.out.strip().splitlines() if str(tmp_path) in line]
     assert written
     for line in written:
@@ -43,8 +38,7 @@ def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs_where_there_
         np.testing.assert_allclose(photographed, images[int(name)].mean(axis=(0, 1)), atol=3e-3)
     for without, told in (("photographs=false", ""), (f"scene.path={tmp_path}/gone.npz", "gone.npz does not exist")):
         (tmp_path / "mean_colors.json").unlink()
-        result = nerf(*given, without)
-        assert result.code == 0, result.err
+        result = done(nerf(*given, without))
         assert told in result.err
         assert json.loads((tmp_path / "mean_colors.json").read_text()) == {}
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 import torch
-from support.running import FAST, FAST_PATH, finished, saved, start
+from support.running import FAST, FAST_PATH, finished, output_of, said, saved, start
 from support.systems import POSIX
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
@@ -39,8 +39,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
     """Weights, moments, occupancy grid, rays per step and per pixel: all of it."""
     # Several rays a pixel from step 21 on: between the two places at which it is stopped.
     shared = (f"trainer.num_threads={threads}", "model.subpixels=2", "model.subpixels_from=0.3")
-    code, output = finished(start(*arguments(capture, tmp_path / "whole", *shared)))
-    assert code == 0, output
+    output_of(start(*arguments(capture, tmp_path / "whole", *shared)))
     folder = tmp_path / "stopped"
     for how, after in ((signal.SIGKILL, 10), (signal.SIGTERM, 25)):
         process = start(*arguments(capture, folder, *shared))
@@ -49,8 +48,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
         process.send_signal(how)
         code, output = finished(process)
         assert code in (-how, 128 + how), output
-    code, output = finished(start(*arguments(capture, folder, *shared)))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, folder, *shared)))
     assert "resuming from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")
     for part in ("global_step", "state_dict", "optimizer_states"):
@@ -64,8 +62,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
 @pytest.mark.slow
 def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     long = ("trainer.max_steps=1000000", "budget.seconds=1", "scheduler.cooldown=1.0")
-    code, output = finished(start(*arguments(capture, tmp_path / "run", *long)))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, tmp_path / "run", *long)))
     content = saved(tmp_path / "run")
     assert 0 < content["global_step"] < 100_000  # a busy machine that compiles kernels on the way has few
     rate = content["optimizer_states"][0]["param_groups"][0]
@@ -82,20 +79,12 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     ("overrides", "parts"),
     [
         (("encoder.log2_table_size=30", "encoder.num_levels=16", "encoder.max_resolution=9999"), ("GiB",)),
-        (("budget.seconds=0",), ("budget.seconds=0", "positive")),
         (("data.sample_budget=100", "data.crop_steps=5"), ("data.sample_budget=100", "no crop")),
         (("encoder.log2_table_size=34",), ("log2_table_size=34",)),
         (("encoder@direction_encoder=hash_grid",), ("directions do not lie in the unit cube",)),
-        (("field=nerf_mlp", "~field.width"), ("field=ngp",)),
     ],
 )
 def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overrides, parts):
     folder = tmp_path / "run"
-    tiny = [x for x in QUIET if not (x.startswith(("field.", "encoder.")) and "field=nerf_mlp" in overrides)]
-    result = nerf("train", "scene=npz", f"scene.path={capture}", *tiny, f"paths.output_dir={folder}", *overrides)
-    assert result.code == 2, result.err
-    complaint = [line for line in result.err.splitlines() if line.startswith("nerf: ")]
-    assert len(complaint) == 1
-    assert "Traceback" not in result.err
-    assert all(part in complaint[0] for part in parts), complaint
+    said(nerf("train", "scene=npz", f"scene.path={capture}", *QUIET, f"paths.output_dir={folder}", *overrides), *parts)
     assert not folder.exists()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from support.configs import composed, options
 from support.peak_bytes import peak_bytes
+from support.running import done
 from support.scenes import ball_scene
 
 from nerf_lightning.commands.train_job import fit, memory_plan
@@ -16,25 +17,6 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.build_step import build_step
 
 CPU = torch.device("cpu")
-
-
-def test_what_a_chain_of_layers_holds_is_counted_to_the_byte_and_views_take_nothing():
-    weight, points = torch.randn(8, 8, requires_grad=True), torch.randn(1000, 8)
-
-    def forward():
-        hidden = points
-        for _ in range(3):
-            hidden = torch.nn.functional.linear(hidden, weight)
-        return hidden
-
-    layer = 1000 * 8 * 4
-    with torch.no_grad():
-        assert peak_bytes(forward, CPU) == 2 * layer  # one goes in, one comes out
-    assert peak_bytes(forward, CPU) == 3 * layer  # the way back needs what lies between
-    assert peak_bytes(forward, torch.device("meta")) == 0
-    before = torch.zeros(1000)
-    assert peak_bytes(lambda: before.view(10, 100).t().add_(1.0), CPU) == 0
-    assert peak_bytes(lambda: before + 1.0, CPU) == 4000
 
 
 def built_for(name, threads, tile):
@@ -79,12 +61,9 @@ def announced(monkeypatch, caplog, level, free):
     return caplog.messages
 
 
-def test_the_parts_of_a_bound_are_details(monkeypatch, caplog):
+def test_the_parts_of_a_bound_are_details_and_a_shortage_is_warned_of_with_what_takes_most(monkeypatch, caplog):
     assert announced(monkeypatch, caplog, logging.INFO, 10**12) == []
     assert len(announced(monkeypatch, caplog, logging.DEBUG, 10**12)) == 5
-
-
-def test_a_shortage_is_warned_of_with_what_takes_most(monkeypatch, caplog):
     (warning,) = announced(monkeypatch, caplog, logging.INFO, 10**6)
     assert "but only 0.0 GB are free, so the system may stop it" in warning
     assert "the samples of a step: lower trainer.tile_points" in warning
@@ -96,8 +75,7 @@ def test_a_short_run_does_not_measure(steps, measured, train, monkeypatch):
     monkeypatch.setattr(fit, "SHORT_RUN", 2)
     monkeypatch.setattr(fit, "measured_tile", lambda *given: asked.append(8192) or (8192, None))
     short = ("trainer.tile_points=auto", f"trainer.max_steps={steps}")
-    result = train(*short, "final.evaluate=false", "final.video=false")
-    assert result.code == 0, result.err
+    done(train(*short, "final.evaluate=false", "final.video=false"))
     assert asked == measured
 
 
@@ -116,7 +94,6 @@ def test_hours_are_said_before_the_first_step(length, line, train, monkeypatch):
     monkeypatch.setattr(fit, "SHORT_RUN", 2)
     monkeypatch.setattr(fit, "measured_tile", lambda *given: (8192, 120.0))
     short = ("trainer.tile_points=auto", "final.evaluate=false", "final.video=false")
-    result = train(*length, *short, "trainer.lightning.fast_dev_run=false")
-    assert result.code == 0, result.err
+    result = done(train(*length, *short, "trainer.lightning.fast_dev_run=false"))
     assert ("time: " in result.err) == (line is not None)
     assert (line or "") in result.err

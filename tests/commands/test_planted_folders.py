@@ -118,6 +118,8 @@ PLANTED = [
     # Classes and programs.
     "scene._target_=os.system",
     "callbacks={evil:{deep:[{_target_:os.system}]}}",
+    "+callbacks.mine._target_=os.system",
+    "++trainer.lightning.profiler={_target_: os.system}",
     "+trainer._args_=[1]",
     "--config-dir=/tmp/evil",
     "encoder@callbacks.evil=frequency",
@@ -225,13 +227,6 @@ def test_loggers_are_typed_again(run, kind, caplog):
     assert not caplog.records
 
 
-def test_values_that_are_paths_name_no_folders(tmp_path):
-    """A job in DIR/0_scene.root=../../../elsewhere would write there."""
-    leave("sweep", tmp_path, "scene.root=../../../elsewhere,b", "seed=0,1")
-    asked = sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"])
-    assert asked[-1] == OWN
-
-
 def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
     planted = ("scene=llff", "scene.root=absent", "scene.name=a,b", "scene.name=../../../ESCAPED")
     leave("sweep", tmp_path / "x" / "sweep", *planted)
@@ -245,7 +240,7 @@ def test_a_sweep_of_a_stranger_makes_no_folder_elsewhere(nerf, tmp_path):
     assert "Traceback" not in result.err
 
 
-def test_what_the_user_types_again_is_the_users(run):
+def test_what_the_user_types_again_is_the_users_and_the_printed_command_asks_for_it(run, tmp_path):
     leave("run", run, "scene.cache_dir=/x", "seed=1")
     assert repeated("run", run, f"resume={run}", "scene.cache_dir=/y") == ["seed=1"]
     leave("sweep", run, "hydra.sweep.subdir=mine", "scene.cache_dir=/x", "seed=0,1")
@@ -253,9 +248,6 @@ def test_what_the_user_types_again_is_the_users(run):
     assert sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={run}", *again]) == [
         "-m", "seed=0,1", "sweep.resume=true", f"hydra.sweep.dir={run}", again[1], OWN.replace(JOB, "ours/${seed}")
     ]  # fmt: skip
-
-
-def test_the_printed_command_repeats_what_the_folder_does_not(tmp_path):
     lines = ["seed=1", "scene.cache_dir=/x y", "paths.root_dir=/z", "scene.root='${oc.env:HOME}'"]
     assert to_give_again(lines) == ["'scene.cache_dir=/x y'", """'scene.root='"'"'${oc.env:HOME}'"'"''"""]
     lines = ["hydra.sweep.dir=x", "seed=0,1", "paths.root_dir=/z", "scene.cache_dir=/x y"]
@@ -264,11 +256,8 @@ def test_the_printed_command_repeats_what_the_folder_does_not(tmp_path):
 
 
 FILES = {
-    "aliases": b"a: &a [x, x]\nb: [*a, *a]\n",
     "numbers": b"[1, 2]\n",
     "objects": b"!!python/object/apply:os.system ['touch ran']\n",
-    "long": b"- x\n" * 2_000_000,
-    "binary": b"\xff\xfe\x00",
 }
 
 
@@ -292,51 +281,21 @@ LOG = "{_target_:logging.FileHandler,filename:'MARK'}"
     ("kind", "planted"),
     [
         ("run", f"+callbacks.evil={LOG}"),
-        ("run", "model=../../evil"),
         ("sweep", f"hydra.launcher={LOG}"),
-        ("sweep", f"+callbacks.evil={LOG},null"),
         ("sweep", "hydra.searchpath=['file://FOLDER/conf']"),
-        ("sweep", "--config-dir=FOLDER/conf"),
-        ("sweep", "hydra/launcher=../../../../../../../../../../FOLDER/conf/evil"),
     ],
 )
 def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_path, kind, planted):
     """FileHandler makes a file, and is none of the names that Hydra itself refuses (os.system is)."""
     mark = tmp_path / "ran"
     (tmp_path / "conf" / "scene").mkdir(parents=True)
-    for name in ("evil.yaml", "scene/npz.yaml"):
-        (tmp_path / "conf" / name).write_text(f"_target_: logging.FileHandler\nfilename: {mark}\n")
+    (tmp_path / "conf" / "scene" / "npz.yaml").write_text(f"_target_: logging.FileHandler\nfilename: {mark}\n")
     planted = planted.replace("MARK", str(mark)).replace("FOLDER", str(tmp_path))
     leave(kind, run, planted, "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1" if kind == "sweep" else "seed=0")
     said(nerf(*go_on_with(kind, run)), "is not taken from a file")
     assert not mark.exists()
     assert sorted(path.name for path in run.iterdir()) == [".hydra", "checkpoints", "run.json"]
     assert list((run / ".hydra").iterdir()) == [record(kind, run)]
-
-
-def test_a_garbled_note_is_damaged(nerf, capture, run):
-    (run / "run.json").write_text('{"fingerprint": ' + "[" * 10_000)
-    leave("run", run, "scene=npz", f"scene.path={capture}", *FAST)
-    nerf("train", f"resume={run}")  # which may say that it caches the pictures
-    said(nerf("train", f"resume={run}"), f"{run / 'run.json'} is damaged", "Remove it")
-
-
-@links
-@pytest.mark.parametrize(
-    "name", ["train.log", "checkpoints", "tensorboard", ".hydra/lock", "images/progress", "metrics.json"]
-)
-def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path, name):
-    victim = tmp_path / "victim"
-    if name in ("checkpoints", "tensorboard", "images/progress"):
-        victim.mkdir()
-    else:
-        victim.write_text("precious")
-    if name == "checkpoints":
-        (run / name).rmdir()
-    (run / name).parent.mkdir(exist_ok=True)
-    (run / name).symlink_to(victim)
-    with pytest.raises(InputError, match=r"is a symbolic link to .*victim.*Remove the link"):
-        require_no_way_out(run)
 
 
 @links
@@ -352,22 +311,28 @@ def test_links_out_of_a_sweep_are_not_written_through(nerf, tmp_path, name, resu
     assert [path.name for path in victim.iterdir()] == ["precious.json"]
 
 
+@links
+@pytest.mark.parametrize(
+    "name", ["train.log", "checkpoints", "tensorboard", ".hydra/lock", "images/progress", "metrics.json"]
+)
+def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path, name):
+    here, victim = tmp_path / "here", tmp_path / "victim"
+    open_run(composed("train", f"paths.output_dir={here}"), 100, None).release()
+    victim.mkdir()
+    (here / name).parent.mkdir(exist_ok=True)
+    (here / name).unlink(missing_ok=True)
+    (here / name).symlink_to(victim)
+    for resume in ("auto", here):
+        with pytest.raises(InputError, match=r"is a symbolic link to .*victim.*Remove the link"):
+            open_run(composed("train", f"paths.output_dir={here}", f"resume={resume}"), 100, None)
+    assert list(victim.iterdir()) == []
+
+
 def test_links_within_a_run_folder_are_fine(run, tmp_path):
     (run / "checkpoints" / "last.ckpt").write_text("")
     (run / "checkpoints" / "best.ckpt").symlink_to("last.ckpt")
     (tmp_path / "link").symlink_to(run)
     require_no_way_out(tmp_path / "link")
-
-
-def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
-    config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
-    open_run(config, 100, None).release()
-    (tmp_path / "victim").write_text("precious")
-    (tmp_path / "here" / "train.log").symlink_to(tmp_path / "victim")
-    for resume in ("auto", f"{tmp_path}/here"):
-        with pytest.raises(InputError, match="symbolic link"):
-            open_run(composed("train", f"paths.output_dir={tmp_path}/here", f"resume={resume}"), 100, None)
-    assert (tmp_path / "victim").read_text() == "precious"
 
 
 @pytest.mark.parametrize("key", ["output_dir", "root_dir"])

@@ -65,9 +65,13 @@ def test_each_folder_that_a_command_makes_is_refused_where_it_is_a_link(
         assert content(thesis) == before
 
 
-def test_the_named_folder_itself_may_be_a_link(nerf, tmp_path):
+def test_the_named_folder_itself_may_be_a_link_and_one_that_nobody_named_may_not(nerf, tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "disk")
     checkpoint = write_checkpoint(tmp_path / "a.ckpt")
     assert nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path}/out").code == 0
     assert (tmp_path / "disk" / "sparse" / "0" / "cameras.txt").is_file()
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    checkpoint = checkpoint.rename(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    (tmp_path / "run" / "export").symlink_to(tmp_path / "disk")
+    said(nerf("export", f"ckpt={checkpoint}", "what=cameras"), "export is a symbolic link to", "paths.output_dir=DIR")

@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST_PATH, FAST_SWEEP, finished, said, saved, start, start_code, start_cold
+from support.running import FAST_PATH, FAST_SWEEP, finished, output_of, said, saved, start, start_code, start_cold
 from support.systems import POSIX
 
 from nerf_lightning.messages.errors import InputError
@@ -45,16 +45,14 @@ def assert_close(folder, other):
 @pytest.fixture(scope="module")
 def alone(capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone") / "run"
-    code, output = finished(start(*arguments(capture, f"paths.output_dir={folder}")))
-    assert code == 0, output
+    output_of(start(*arguments(capture, f"paths.output_dir={folder}")))
     return folder
 
 
 @pytest.mark.minutes
 def test_two_processes_follow_one(capture, tmp_path, alone):
     """Uneven shares of 101 rays, random backgrounds; views of the evaluation and frames of the film are dealt out."""
-    code, output = finished(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))
-    assert code == 0, output
+    output = output_of(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))
     assert_close(tmp_path, alone)
     assert output.count("test PSNR") == 1, "one process speaks"
     assert output.count("2 processes") == 1
@@ -88,8 +86,7 @@ def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path,
     code, output = finished(process)
     assert code == 128 + signal.SIGTERM, output
     assert STEPS // 2 <= saved(tmp_path)["global_step"] < STEPS
-    code, output = finished(start("train", f"resume={tmp_path}", "trainer=cpu", f"trainer.max_steps={STEPS}"))
-    assert code == 0, output
+    output_of(start("train", f"resume={tmp_path}", "trainer=cpu", f"trainer.max_steps={STEPS}"))
     assert_close(tmp_path, alone)
 
 
@@ -120,29 +117,9 @@ def test_a_worker_ends_with_the_process_that_has_started_it():
 
 
 @pytest.mark.exhaustive
-@POSIX
-def test_workers_end_with_the_process_that_has_started_them(capture, tmp_path):
-    process = start(*arguments(capture, *TWO, "trainer.max_steps=1000000", f"paths.output_dir={tmp_path}"))
-    while process.poll() is None and saved(tmp_path)["global_step"] == 0:
-        time.sleep(0.02)
-    workers = [each for each in psutil.Process(process.pid).children() if "nerf_lightning.cli.worker" in each.cmdline()]
-    process.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + 30
-    while living := [worker for worker in workers if is_alive(worker)]:
-        if time.monotonic() > deadline:
-            for worker in living:
-                worker.kill()
-            pytest.fail(f"{len(living)} workers live on")
-        time.sleep(0.05)
-    code, output = finished(process)
-    assert (code, len(workers)) == (-signal.SIGKILL, 2), output
-
-
-@pytest.mark.exhaustive
 def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
     for name, extra in (("one", ()), ("two", TWO)):
-        code, output = finished(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
-        assert code == 0, output
+        output_of(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
     one, two = saved(tmp_path / "one")["nerf_lightning"], saved(tmp_path / "two")["nerf_lightning"]
     assert one["progress"] == two["progress"]
     assert one["progress"]["batch_rays"] < 256
@@ -151,57 +128,36 @@ def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_p
     assert two == pytest.approx(one, abs=0.2)
 
 
-@pytest.mark.slow
-@pytest.mark.exhaustive
-def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
-    quick = ("trainer.max_steps=3", "final.evaluate=false")
-    sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")
-    code, output = finished(start(sweep[0], "-m", *sweep[1:]))
-    assert code == 0, output
-    steps = {folder.name: saved(folder)["global_step"] for folder in tmp_path.glob("*seed=*")}
-    assert steps == {"0_seed=0": 3, "1_seed=1": 3}
+TORCHRUN = {"TORCHELASTIC_RUN_ID": "1"}
+SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
+SLURM = {f"SLURM_{name}": value for name, value in SLURM.items()}
 
 
-def test_what_was_not_started_is_said(nerf, capture, monkeypatch):
-    for name in ("torchrun", "slurm"):
-        result = nerf(*arguments(capture, f"trainer={name}"))
-        assert result.code == 2
-        assert f"trainer={name}: this process was not started by" in result.err
-
-
-def test_processes_that_would_train_alone_are_refused(nerf, capture, monkeypatch):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
-    result = nerf(*arguments(capture))
-    assert result.code == 2
-    assert "Add trainer=torchrun" in result.err
+@pytest.mark.parametrize(
+    ("environment", "more", "words"),
+    [
+        ({}, ["trainer=torchrun"], ("trainer=torchrun: this process was not started by",)),
+        ({}, ["trainer=slurm"], ("trainer=slurm: this process was not started by",)),
+        (TORCHRUN, [], ("Add trainer=torchrun",)),
+        (SLURM, [], ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
+        (SLURM, ["trainer=slurm"], ("not started by Slurm's srun",)),
+        (SLURM | {"SLURM_STEP_ID": "0"}, ["trainer=slurm"], ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
+    ],
+)
+def test_processes_that_would_not_train_together_are_refused(
+    nerf, capture, monkeypatch, tmp_path, environment, more, words
+):
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    said(nerf(*arguments(capture, f"paths.output_dir={tmp_path}/run", *more)), *words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
-    command, *rest = arguments(capture, "trainer=torchrun", "seed=0,1", f"paths.output_dir={tmp_path}")
-    result = nerf(command, "-m", *rest)
+    result = nerf(*arguments(capture, "trainer=torchrun", "-m", "seed=0,1", f"paths.output_dir={tmp_path}"))
     assert result.code == 2
     assert "each of the processes would run the sweep by itself" in result.err
-
-
-SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
-
-
-@pytest.mark.parametrize(
-    ("trainer", "more", "words"),
-    [
-        ("cpu", {}, ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
-        ("slurm", {}, ("not started by Slurm's srun",)),
-        ("slurm", {"STEP_ID": "0"}, ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
-    ],
-)
-def test_a_slurm_job_whose_tasks_would_not_train_together_is_refused(
-    nerf, capture, monkeypatch, tmp_path, trainer, more, words
-):
-    for name, value in (SLURM | more).items():
-        monkeypatch.setenv(f"SLURM_{name}", value)
-    said(nerf(*arguments(capture, f"trainer={trainer}", f"paths.output_dir={tmp_path}/run")), *words)
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_process_needs_a_device_and_the_first_failure_of_its_own_is_the_exit_code(monkeypatch):

@@ -14,7 +14,7 @@ from nerf_lightning.evaluation.protocol import commit, config_hash, differences,
 MEASURED = {"scene": "a", "split": "test", "background": "white", "pixels": "float", "lpips": None}
 
 
-def test_the_protocol_says_all_that_moves_a_number():
+def test_the_protocol_says_all_that_moves_a_number_and_the_origin_whose_it_is():
     scene = ball_scene()
     how = measured_how(scene, "test", [3, 4], "random", quantize=True, lpips="vgg")
     assert how["background"] == "white"
@@ -22,9 +22,6 @@ def test_the_protocol_says_all_that_moves_a_number():
     assert (how["pixels"], how["masks"], how["cameras"], how["lpips"]) == ("8-bit", "none", "raw", "vgg, version 0.1")
     fewer = measured_how(scene, "test", [3], "random", quantize=True, lpips="vgg")
     assert differences(how, fewer) == [f"split_hash: {how['split_hash']} and {fewer['split_hash']}"]
-
-
-def test_the_origin_says_whose_numbers_they_are():
     config = "seed: 3\noptimizer:\n  lr: 1\n"
     of = measured_of(tiny_model(), config, {"model": "nerf_tiny", "scene": "npz"}, torch.device("cpu"), "32-true")
     assert (of["model"], of["scene"], of["seed"], of["version"]) == ("nerf_tiny", "npz", 3, __version__)

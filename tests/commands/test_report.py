@@ -8,7 +8,7 @@ import shutil
 import pytest
 from support.browser import SIZES, layout_faults, opened
 from support.measured_runs import leave_measured_run
-from support.running import finished, said, start
+from support.running import done, output_of, said, start
 
 from nerf_lightning.commands import report
 
@@ -17,8 +17,7 @@ from nerf_lightning.commands import report
 def page_of_run(finished_run, tmp_path_factory):
     """The page of a real run, written by a process of its own; with what the command printed."""
     folder = tmp_path_factory.mktemp("page")
-    code, output = finished(start("report", finished_run, f"paths.output_dir={folder}"))
-    assert code == 0, output
+    output = output_of(start("report", finished_run, f"paths.output_dir={folder}"))
     return folder / "report.html", output
 
 
@@ -94,8 +93,7 @@ def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
 def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished_run, run)
-    result = nerf("report", run, f"scene.path={tmp_path}/gone.npz")
-    assert result.code == 0, result.err
+    result = done(nerf("report", run, f"scene.path={tmp_path}/gone.npz"))
     assert "left out     The doctor" in result.out
     text = (run / "report.html").read_text()
     assert "gone.npz" in text
@@ -107,16 +105,14 @@ def test_photographs_on_a_disk_that_fails_are_left_out(nerf, finished_run, tmp_p
         raise OSError(5, "Input/output error", "photographs/IMG_7.jpg")
 
     monkeypatch.setattr(report, "examine", fail)
-    result = nerf("report", finished_run, f"paths.output_dir={tmp_path}")
-    assert result.code == 0, result.err
+    result = done(nerf("report", finished_run, f"paths.output_dir={tmp_path}"))
     assert "left out     The doctor: photographs/IMG_7.jpg: Input/output error" in result.out
     assert "capture" in sections((tmp_path / "report.html").read_text())
 
 
 def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
     run = leave_measured_run(tmp_path / "run", None)
-    result = nerf("report", run)
-    assert result.code == 0, result.err
+    done(nerf("report", run))
     text = (run / "report.html").read_text()
     assert sections(text) == ["missing"]
     for what in ("Numbers", "Curves", "Coverage", "The doctor", "Config"):
@@ -138,14 +134,8 @@ EVIL = (
 @pytest.fixture
 def evil_run(tmp_path):
     """A run whose every text is markup."""
-    run = leave_measured_run(
-        tmp_path / "run",
-        overrides=(EVIL,),
-        protocol={EVIL: EVIL, "scene": EVIL},
-        origin={"model": EVIL, EVIL: [EVIL]},
-        started=EVIL,
-        result=EVIL,
-    )
+    texts = {"protocol": {EVIL: EVIL, "scene": EVIL}, "origin": {"model": EVIL, EVIL: [EVIL]}}
+    run = leave_measured_run(tmp_path / "run", overrides=(EVIL,), started=EVIL, result=EVIL, **texts)
     metrics = json.loads((run / "metrics.json").read_text())
     metrics |= {"per_image": [{"name": EVIL, "psnr": 20.0}], "worst_views": [EVIL], "pictures": ["../../secret", EVIL]}
     metrics["environment"] = {"torch": EVIL}
@@ -155,8 +145,7 @@ def evil_run(tmp_path):
 
 
 def test_markup_in_a_strangers_run_is_shown_and_not_obeyed(nerf, evil_run):
-    result = nerf("report", evil_run, "doctor=false")
-    assert result.code == 0, result.err
+    done(nerf("report", evil_run, "doctor=false"))
     text = (evil_run / "report.html").read_text()
     assert text.count("<script>") == 1
     assert 'onerror="' not in text
@@ -188,8 +177,7 @@ def test_what_is_too_large_or_no_film_or_no_log_is_left_out(nerf, tmp_path):
     (run / "tensorboard" / "events.out.tfevents.0").write_bytes(b"\xff" * 1000)
     (run / "images" / "validation").mkdir(parents=True)
     (run / "images" / "validation" / "step_0000001.png").write_bytes(b"no picture")
-    result = nerf("report", run, "max_megabytes=1", "doctor=false")
-    assert result.code == 0, result.err
+    result = done(nerf("report", run, "max_megabytes=1", "doctor=false"))
     assert "video.mp4 has 1,200,000 bytes, more than the limit of 1,000,000" in result.out
     assert "depth.mp4 is not an mp4" in result.out
     assert "left out     A picture of the validation" in result.out

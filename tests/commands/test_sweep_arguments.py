@@ -21,13 +21,16 @@ def test_the_flag_comes_first_wherever_it_was_typed_and_a_single_run_stays_as_it
     assert sweep_arguments(["seed=0", "paths.output_dir=out"]) == ["seed=0", "paths.output_dir=out"]
 
 
-def test_what_the_release_candidates_of_hydra_cannot_remove_is_refused_before_a_folder_is_made(monkeypatch):
+def test_what_cannot_be_started_is_refused_before_a_folder_is_made(monkeypatch):
     asked = ["-m", "seed=0,1", "~callbacks.monitor"]
     monkeypatch.setattr(hydra_versions, "SWEEPS_REMOVE", True)
     assert "~callbacks.monitor" in sweep_arguments(asked)
     monkeypatch.setattr(hydra_versions, "SWEEPS_REMOVE", False)
     with pytest.raises(InputError, match=r"~callbacks.monitor.*'hydra-core<1.4'"):
         sweep_arguments(asked)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match=r"Slurm's srun, which is not found here.*hydra/launcher=parallel"):
+        sweep_arguments(["-m", "hydra/launcher=slurm", "seed=0,1"])
 
 
 def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):
@@ -96,9 +99,3 @@ def test_a_typo_is_not_taken_for_a_missing_plugin(nerf):
     result = nerf("train", "-m", "hydra/launcher=joblibb", "seed=0,1")
     assert result.code == 2
     assert "not installed" not in result.err
-
-
-def test_slurm_without_srun_is_refused_before_a_folder_is_taken(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(InputError, match=r"Slurm's srun, which is not found here.*hydra/launcher=parallel"):
-        sweep_arguments(["-m", "hydra/launcher=slurm", "seed=0,1"])

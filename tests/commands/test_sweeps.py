@@ -10,12 +10,11 @@ from subprocess import STDOUT
 import pytest
 import torch
 from omegaconf import OmegaConf
-from support.running import FAST_SWEEP, finished, start, start_code
+from support.running import FAST_SWEEP, done, finished, output_of, start, start_code
 from support.systems import POSIX
 
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.runs import sweep
-from nerf_lightning.runs.sweep_job import stop_file
 
 ALL_CORES = """
 import os, sys
@@ -29,10 +28,6 @@ QUICK = (*FAST_SWEEP, "logger=none", "final.video=false", "callbacks.checkpoints
 
 def arguments(capture, folder, *more):
     return ("train", "-m", "scene=npz", f"scene.path={capture}", *QUICK, f"paths.output_dir={folder}", *more)
-
-
-def run(*words, **options):
-    return finished(start(*words, **options))
 
 
 def table(folder):
@@ -59,8 +54,7 @@ def wait_for_step(folder, step, process):
 def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, launcher):
     sweep = arguments(capture, tmp_path, f"hydra/launcher={launcher}", "seed=0,1")
     # Jobs that share the cores share all of them, however many the tests leave to each other.
-    code, output = finished(start_code(f"argv = {['nerf', *sweep]}\n{ALL_CORES}", stderr=STDOUT))
-    assert code == 0, output
+    output = output_of(start_code(f"argv = {['nerf', *sweep]}\n{ALL_CORES}", stderr=STDOUT))
     assert "Warning" not in output
     rows = table(tmp_path)
     psnr = [float(row["PSNR"]) for row in rows]
@@ -96,25 +90,20 @@ def test_jobs_side_by_side_have_the_cores_that_slurm_gave(monkeypatch):
 @pytest.mark.minutes
 def test_a_search_maximises_the_psnr_and_goes_on_where_it_was(capture, tmp_path):
     search = ("hydra/sweeper=search", "optimizer.lr=tag(log, interval(1e-4, 1e-2))")
-    code, output = run(*arguments(capture, tmp_path, *search, "hydra.sweeper.n_trials=2"))
-    assert code == 0, output
+    output_of(start(*arguments(capture, tmp_path, *search, "hydra.sweeper.n_trials=2")))
     first = table(tmp_path)
     assert len(first) == 2
     best = (tmp_path / "optimization_results.yaml").read_text()
     assert f"best_value: {first[0]['PSNR']}" in best
-    code, output = run("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "hydra.sweeper.n_trials=3")
-    assert code == 0, output
+    output_of(start("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "hydra.sweeper.n_trials=3"))
     again = table(tmp_path)
     assert sorted(row["state"] for row in again) == ["finished", "finished before", "finished before"]
     assert {row["optimizer.lr"] for row in first} < {row["optimizer.lr"] for row in again}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["basic", pytest.param("parallel", marks=pytest.mark.exhaustive)])
-def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
-    code, output = run(
-        *arguments(capture, tmp_path, f"hydra/launcher={launcher}", "data.batch_rays=-1,64", "optimizer.lr=1e-3")
-    )
+def test_a_job_that_fails_costs_only_itself(capture, tmp_path):
+    code, output = finished(start(*arguments(capture, tmp_path, "data.batch_rays=-1,64", "optimizer.lr=1e-3")))
     assert code == 2, output
     assert "Traceback" not in output
     complaint = "1 of 2 jobs failed. 0_data.batch_rays=-1: data.batch_rays=-1: at least one ray is needed."
@@ -135,8 +124,7 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     command = told.partition("resume with: nerf ")[2].split()
     assert command == ["train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "logger=none"]
     before = json.loads((tmp_path / "0_seed=0" / "run.json").read_text())
-    code, output = run(*command)
-    assert code == 0, output
+    output = output_of(start(*command))
     assert "job 0 has finished before" in output
     assert "resuming from step" in output
     assert json.loads((tmp_path / "0_seed=0" / "run.json").read_text()) == before
@@ -145,18 +133,16 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("how", [pytest.param("Ctrl-C", marks=POSIX), "the stop file, as on Windows"])
-def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path, how):
+@POSIX
+def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
+    """By the stop file, as on Windows: tests/test_other_systems.py."""
     longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
     process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)
     for folder in ("0_seed=0", "1_seed=1"):
         wait_for_step(tmp_path / folder, 10, process)
-    if how == "Ctrl-C":
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    else:
-        stop_file(tmp_path).touch()
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     code, output = finished(process)
-    assert code == (130 if how == "Ctrl-C" else 1), output
+    assert code == 130, output
     assert [row["state"] for row in table(tmp_path)] == ["stopped", "stopped"]
     assert output.count("stopped at step") == 2
     assert f"resume with  nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output
@@ -192,10 +178,8 @@ def test_a_sweep_is_not_begun_where_one_has_been_but_can_be_extended(nerf, captu
     refused = nerf(*arguments(capture, tmp_path, "seed=0,1"))
     assert refused.code == 2
     assert "already holds runs of a sweep. Add sweep.resume=true" in refused.err
-    done = nerf("train", "-m", "seed=1,0", "sweep.resume=true", f"paths.output_dir={tmp_path}")
-    assert done.code == 0, done.err
+    done(nerf("train", "-m", "seed=1,0", "sweep.resume=true", f"paths.output_dir={tmp_path}"))
     states = {row["seed"]: row["state"] for row in table(tmp_path)}
     assert states == {"0": "finished before", "1": "finished"}
-    other = nerf("train", "-m", "seed=0", "evaluation.max_views=1", "sweep.resume=true", f"paths.output_dir={tmp_path}")
-    assert other.code == 0, other.err
+    done(nerf("train", "-m", "seed=0", "evaluation.max_views=1", "sweep.resume=true", f"paths.output_dir={tmp_path}"))
     assert table(tmp_path)[0]["state"] == "finished", "another evaluation is not the same job"

@@ -1,4 +1,4 @@
-"""`nerf table`: which runs it finds, what it puts together, what it refuses."""
+"""`nerf table`: which runs it finds, what it puts together and refuses; of strangers' runs, texts stay texts."""
 
 import csv
 import json
@@ -6,7 +6,7 @@ import statistics
 
 import pytest
 from support.measured_runs import PROTOCOL, leave_measured_run, ours
-from support.running import said
+from support.running import done, said
 
 
 def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
@@ -26,16 +26,12 @@ def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
 
 
 def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
-    for number, rate in enumerate(("1e-2", "1e-3")):
-        leave_measured_run(
-            tmp_path / "runs" / str(number),
-            20.0 + number,
-            overrides=(f"optimizer.lr={rate}", "trainer.max_steps=10", f"paths.output_dir={number}"),
-        )
+    for number, (rate, space) in enumerate((("1e-2", "bounded"), ("1e-3", "contracted"))):
+        overrides = (f"optimizer.lr={rate}", f"scene.space={space}", "trainer.max_steps=10")
+        leave_measured_run(tmp_path / "runs" / str(number), 20.0 + number, overrides=overrides)
     _, rows = table("published=false")
-    assert [row["optimizer.lr"] for row in rows] == ["0.001", "0.01"]
+    assert [(row["optimizer.lr"], row["scene.space"]) for row in rows] == [("0.001", "contracted"), ("0.01", "bounded")]
     assert "trainer.max_steps" not in rows[0]
-    assert "paths.output_dir" not in rows[0]
 
 
 def test_what_a_run_did_not_say_is_told_from_its_config(table, tmp_path):
@@ -56,18 +52,6 @@ def test_settings_without_a_column_are_counted_below(table, tmp_path):
     assert "2 more settings differ and have no column: optimizer.a32, optimizer.a33." in result.out
 
 
-def test_what_was_swept_within_model_or_scene_is_shown(table, tmp_path):
-    for resolution, space in ((32, "bounded"), (64, "bounded"), (64, "contracted")):
-        leave_measured_run(
-            tmp_path / "runs" / f"{resolution}_{space}",
-            overrides=(f"model.levels.fine.sampler.resolution={resolution}", f"scene.space={space}", "model=fast"),
-            origin={"config": f"{resolution} {space}"},
-        )
-    _, rows = table("published=false")
-    shown = {(row["model.levels.fine.sampler.resolution"], row["scene.space"]) for row in rows}
-    assert shown == {("32", "bounded"), ("64", "bounded"), ("64", "contracted")}
-
-
 BESIDE_THE_RESULT = (
     *("model={}", "scene={}", "scene@scene={}", "resume={}", "path={}", "path.num_frames={}", "logger={}"),
     *("logger.tensorboard.name={}", "~logger.tensorboard={}", "paths.output_dir={}", "sweep.resume={}"),
@@ -85,6 +69,16 @@ def test_where_things_lie_and_what_is_said_of_a_run_makes_no_row(table, tmp_path
     assert not [column for column in row if "=" in column or "." in column]
 
 
+@pytest.mark.parametrize("place", ["scene.root=data/{}", "scene.path='data/{}.npz'"])
+def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder_with_its_dots(table, tmp_path, place):
+    for name in ("lego_200", "room.v3"):
+        overrides = ("scene=blender", place.format(name))
+        leave_measured_run(tmp_path / "runs" / name, protocol={"scene": "blender"}, overrides=overrides)
+    _, rows = table()
+    assert [row["scene"] for row in ours(rows)] == ["lego_200", "room.v3"]
+    assert len(rows) == 13  # eleven have published theirs of lego
+
+
 def test_published_numbers_stand_below_with_their_source(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a", 33.0)
     leave_measured_run(tmp_path / "runs" / "b", 20.0, protocol={"scene": "bricks"}, origin={"scene": "bricks"})
@@ -99,34 +93,19 @@ def test_published_numbers_stand_below_with_their_source(table, tmp_path):
     assert "Zip-NeRF (published)" in result.out
 
 
-def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder(table, tmp_path):
-    leave_measured_run(
-        tmp_path / "runs" / "a", protocol={"scene": "blender"}, overrides=("scene=blender", "scene.root=data/lego_200")
-    )
-    _, rows = table()
-    assert ours(rows)[0]["scene"] == "lego_200"
-    assert len(rows) == 12
-
-
-@pytest.mark.parametrize("place", ["scene.root=data/room.{}", "scene.path='data/room.{}.npz'"])
-def test_the_dots_of_a_folders_name_belong_to_it(table, tmp_path, place):
-    for version in ("v2", "v3"):
-        overrides = ("scene=blender", place.format(version))
-        leave_measured_run(tmp_path / "runs" / version, protocol={"scene": "blender"}, overrides=overrides)
-    _, rows = table("published=false")
-    assert [row["scene"] for row in rows] == ["room.v2", "room.v3"]
-
-
-def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
+@pytest.mark.parametrize(
+    ("protocol", "words"),
+    [
+        ({"pixels": "8-bit"}, ("runs/a", "runs/b", "pixels: float and 8-bit", "force=true", "measured=eval")),
+        ({"split_hash": "f" * 16, "resolution": [[400, 400]]}, ("(resolution: 800 x 800 and 400 x 400)",)),
+        ({"split_hash": "f" * 16}, ("(different views, although the settings are the same: the capture has changed)",)),
+    ],
+)
+def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path, protocol, words):
     leave_measured_run(tmp_path / "runs" / "a")
-    leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
-    result, _ = table()
-    said(result, "runs/a", "runs/b", "pixels: float and 8-bit", "force=true", "measured=eval")
+    leave_measured_run(tmp_path / "runs" / "b", protocol=protocol, origin={"config": "b"})
+    said(table()[0], *words)
     assert not (tmp_path / "out").exists()
-    result, rows = table("force=true")
-    assert len(ours(rows)) == 2
-    assert "Not all of these were measured the same way" in result.out
-    assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
 
 
 def test_other_pictures_are_told_by_the_settings_that_chose_them(table, tmp_path):
@@ -139,22 +118,9 @@ def test_other_pictures_are_told_by_the_settings_that_chose_them(table, tmp_path
     said(result, "runs/a", "runs/b", "(different views: scene.num_test=8 and scene.num_test=16)")
     assert "split_hash" not in result.err
     text = table("force=true")[0].out
+    assert "Not all of these were measured the same way" in text
     assert "different views: scene.num_test=8 and scene.num_test not set" in text
     assert "split_hash" not in text
-
-
-def test_what_makes_the_pictures_differ_is_told_alone(table, tmp_path):
-    leave_measured_run(tmp_path / "runs" / "a")
-    other = {"split_hash": "f" * 16, "resolution": [[400, 400]]}
-    leave_measured_run(tmp_path / "runs" / "b", protocol=other, origin={"config": "b"})
-    result, _ = table()
-    said(result, "(resolution: 800 x 800 and 400 x 400)")
-
-
-def test_pictures_that_no_setting_tells_apart_are_said_to_be_other_files(table, tmp_path):
-    leave_measured_run(tmp_path / "runs" / "a")
-    leave_measured_run(tmp_path / "runs" / "b", protocol={"split_hash": "f" * 16}, origin={"config": "b"})
-    said(table()[0], "(different views, although the settings are the same: the capture has changed)")
 
 
 def test_a_class_of_ones_own_has_the_column_of_its_group(table, tmp_path):
@@ -253,14 +219,11 @@ def test_nothing_to_show_is_said(nerf, table, tmp_path, monkeypatch):
     said(nerf("table"), "runs=outputs: outputs does not exist")
 
 
-def test_pictures_of_several_sizes_are_counted(table, tmp_path):
-    leave_measured_run(tmp_path / "runs" / "a", protocol={"resolution": [[8, 6], [8, 9], [9, 9]]})
-    assert ours(table()[1])[0]["resolution"] == "8 x 6 and 2 more"
-
-
 def test_the_steps_of_a_run_that_never_finished_and_what_was_evaluated_alone_come_from_measurements(table, tmp_path):
-    leave_measured_run(tmp_path / "runs" / "a", origin={"step": 70}, finished_at_step=None)
-    assert ours(table()[1])[0]["steps"] == "70"
+    sizes = {"resolution": [[8, 6], [8, 9], [9, 9]]}
+    leave_measured_run(tmp_path / "runs" / "a", protocol=sizes, origin={"step": 70}, finished_at_step=None)
+    (row,) = ours(table()[1])
+    assert (row["steps"], row["resolution"]) == ("70", "8 x 6 and 2 more")
     (tmp_path / "runs" / "a" / "run.json").unlink()
     assert len(ours(table()[1])) == 1
 
@@ -293,10 +256,8 @@ def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypat
     assert f"a{head.count('some_long_setting')}.some_long_setting" in f"{lines[end]} a6.some_long_setting"
 
 
-@pytest.mark.slow
 def test_a_real_run_is_a_row(nerf, finished_run, tmp_path):
-    result = nerf("table", finished_run, f"out={tmp_path}")
-    assert result.code == 0, result.err
+    done(nerf("table", finished_run, f"out={tmp_path}"))
     (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
     metrics = json.loads((finished_run / "metrics.json").read_text())
     assert (row["scene"], row["model"], row["steps"]) == ("ball", "nerf_tiny", "20")
@@ -328,3 +289,60 @@ def test_files_are_written_only_where_they_are_asked_for(nerf, tmp_path, monkeyp
         monkeypatch.chdir(tmp_path / "here")
         assert nerf("table", tmp_path / "runs", out).code == 0
         assert {path.name for path in (tmp_path / "here" / "tables").iterdir()} == wanted
+
+
+def test_texts_of_strangers_stay_texts(table, tmp_path):
+    names = ("=cmd|' /C calc'!A0", "<script>alert(1)</script>", "[/red]\x1b[2J| a\nb")
+    for number, name in enumerate(names):
+        leave_measured_run(tmp_path / "runs" / str(number), origin={"model": name, "config": name})
+    result, rows = table("published=false")
+    assert result.code == 0, result.err
+    assert "\x1b[2J" not in result.out
+    assert {row["model"][0] for row in rows} == {"'", "<", "["}
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "<script>" not in text
+    assert len(text.splitlines()) == 2 + len(names)
+    page = (tmp_path / "out" / "table.html").read_text()
+    assert "<script>alert" not in page
+    assert "\x1b" not in page
+
+
+DAMAGED = {
+    "not json": "{",
+    "a list": "[]",
+    "no numbers": '{"psnr": "30"}',
+    "a huge number": f'{{"psnr": 1{"0" * 400}}}',
+    "NaN": '{"psnr": NaN}',
+    "deep": "[" * 100 + "]" * 100,
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_damaged_metrics_are_no_numbers(table, tmp_path, content):
+    leave_measured_run(tmp_path / "runs" / "a")
+    run = leave_measured_run(tmp_path / "runs" / "b")
+    (run / "metrics.json").write_text(content)
+    result, rows = table()
+    assert result.code == 0, result.err
+    assert len(ours(rows)) == 1
+    assert "runs/b" in " ".join(result.out.split())
+
+
+DAMAGED_ORIGINS = [
+    {"seed": [1], "parameters": "x", "model": {"a": 1}},
+    {"seed": None, "config": ["a", {"b": []}], "scene": [], "version": {}, "megabytes": True},
+    *({"seed": seed} for seed in ("--5", "-", "\u0663", "\u00b2", "9" * 5000, 1.5, True)),
+    {"seed": None, "model": "\ud800", "scene": "\ud800", "device": "\ud800"},
+]
+
+
+@pytest.mark.parametrize("origin", DAMAGED_ORIGINS, ids=lambda origin: ascii(origin)[:40])
+def test_damaged_parts_of_metrics_are_left_out(table, tmp_path, origin):
+    run = leave_measured_run(tmp_path / "runs" / "a", started=7, finished_at_step=["x"], training_seconds={})
+    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": origin}
+    (run / "metrics.json").write_text(json.dumps(content))
+    leave_measured_run(tmp_path / "runs" / "b", 19.0, seed=1)
+    result, rows = table("force=true")
+    assert result.code == 0, result.err
+    assert "20.0" in [row["PSNR"] for row in rows]
+    assert all(row["seeds"] in ("", "1") for row in ours(rows))

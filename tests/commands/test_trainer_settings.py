@@ -55,29 +55,23 @@ def test_a_precision_that_is_asked_for_is_taken_with_a_warning_where_it_is_slow(
     assert "no native bfloat16" in caplog.text
 
 
-def test_the_length_is_the_smaller_of_steps_and_epochs():
+def test_the_length_is_the_smaller_of_steps_and_epochs_and_no_steps_at_all_are_refused():
     assert TrainerSettings(max_steps=100).num_steps(1000, 10, 0) == 100
     assert TrainerSettings(max_steps=1000, max_epochs=1).num_steps(1000, 10, 0) == 100
     assert TrainerSettings(max_steps=1000, max_epochs=0.5).num_steps(1001, 10, 0) == 50
     assert TrainerSettings(max_steps=70, max_epochs=3).num_steps(1000, 10, 0) == 70
     assert TrainerSettings(max_epochs=2).num_steps(995, 10, 30) == 229  # the crop is no epoch
-
-
-def test_no_steps_at_all_and_norms_that_are_none_are_refused():
     for name, value in (("max_steps", 0), ("val_every_steps", 0), ("clip_norm", -1), ("clip_norm", float("nan"))):
         with pytest.raises(InputError, match=f"trainer.{name}={value}"):
             TrainerSettings(**{name: value})
 
 
-def test_tiles_can_be_chosen_and_switched_off():
+def test_tiles_can_be_chosen_and_switched_off_and_measured_ones_are_kept_within_reason():
     assert TrainerSettings(accelerator="cpu").tile_points == CPU_TILE_POINTS
     assert TrainerSettings(tile_points=99).tile_points == 99
     whole = TrainerSettings(accelerator="cpu", tile_points=None)
     assert whole.tile_points is None
     assert whole.inference_tile_points == CPU_TILE_POINTS
-
-
-def test_what_a_run_measured_is_kept_as_far_as_somebody_could_have_measured_it_but_does_not_overrule():
     measured = TrainerSettings(accelerator="cpu")
     measured.keep_tile(65536)
     assert measured.inference_tile_points == 65536

@@ -40,14 +40,23 @@ def own(tmp_path):
     return (tmp_path / "own").write_text
 
 
-def test_without_control_groups_it_is_the_machines():
+def test_without_control_groups_or_a_limit_it_is_the_machines(own, group):
+    assert free_memory() == 10_000
+    own("4:memory:/\n0::/\n")
+    group("memory", limit_in_bytes=UNLIMITED, usage_in_bytes=900, stat="")
+    group("", max="max", current=900, stat="")
     assert free_memory() == 10_000
 
 
-def test_a_container_of_version_2_has_its_limit(own, group):
+def test_a_container_of_version_2_has_its_limit_if_that_can_be_read(own, group):
     own("0::/\n")
     group("", max=1000, current=900, stat=HOLDS_FILES)
     assert free_memory() == 1000 - 900 + 150 + 50
+    group("", max=1000, current=1100, stat="")
+    assert free_memory() == 0
+    own("0::/\nnonsense\n")
+    group("", max="", current="many", stat="")
+    assert free_memory() == 10_000
 
 
 @pytest.mark.parametrize("path", ["docker/1f", "not/mounted"])
@@ -66,22 +75,6 @@ def test_the_narrowest_of_the_groups_around_a_job_counts(own, group):
     assert free_memory() == 500
 
 
-def test_no_limit_leaves_what_the_machine_has(own, group):
-    own("4:memory:/\n0::/\n")
-    group("memory", limit_in_bytes=UNLIMITED, usage_in_bytes=900, stat="")
-    group("", max="max", current=900, stat="")
-    assert free_memory() == 10_000
-
-
-def test_a_group_beyond_its_limit_has_nothing_free_and_what_cannot_be_read_is_no_limit(own, group):
-    own("0::/\n")
-    group("", max=1000, current=1100, stat="")
-    assert free_memory() == 0
-    own("0::/\nnonsense\n")
-    group("", max="", current="many", stat="")
-    assert free_memory() == 10_000
-
-
 @pytest.fixture(autouse=True)
 def _eight(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
@@ -89,11 +82,8 @@ def _eight(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_all_that_the_process_may_run_on_are_ours():
+def test_all_that_the_process_may_run_on_are_ours_but_no_more_than_slurm_gave(monkeypatch):
     assert num_cores() == 8
-
-
-def test_no_more_than_slurm_gave(monkeypatch):
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "4")
     assert num_cores() == 4
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "16")

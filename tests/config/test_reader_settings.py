@@ -2,7 +2,6 @@
 
 from dataclasses import MISSING, dataclass, fields
 
-import pytest
 from omegaconf import OmegaConf
 from support.configs import composed
 from support.planted import write_checkpoint
@@ -49,24 +48,20 @@ def test_the_yaml_has_the_settings_that_the_class_has():
     assert OmegaConf.load(conf_folder() / "capture_defaults.yaml") == settings
 
 
-@pytest.mark.parametrize("scene", ["colmap", "llff", "transforms"])
-def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path, scene):
+def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path):
     def of_this(content):
-        content["nerf_lightning"]["choices"]["scene"] = scene
+        content["nerf_lightning"]["choices"]["scene"] = "colmap"
 
     recorded = {"downscale": 2, "root": str(tmp_path), "cache_dir": "/tmp/x"}
     file = write_checkpoint(tmp_path / "a.ckpt", of_this, scene=recorded)
     overrides = scene_overrides(str(file))
-    assert {f"scene={scene}", "scene.downscale=2", f"scene.root='{tmp_path}'"} <= set(overrides)
+    assert {"scene=colmap", "scene.downscale=2", f"scene.root='{tmp_path}'"} <= set(overrides)
     assert not [each for each in overrides if "cache_dir" in each]
 
 
-def test_every_kernel_of_models_and_of_exporters_compiles():
+def test_an_exporter_is_known_by_its_yaml_and_every_kernel_of_models_and_of_exporters_compiles():
     modules = kernel_modules()
     assert "nerf_lightning.nerf.kernels.march.cpu" in modules
     assert all(backend(module) for module in modules)
-
-
-def test_an_exporter_is_known_by_its_yaml_and_one_of_somebody_else_is_not():
     assert exporter_class("images") is ImagesExport
     assert exporter_class("my_own") is None

@@ -8,7 +8,6 @@ from functools import cache
 from types import UnionType
 from typing import Union, get_args, get_origin
 
-import pytest
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from support.configs import composed, groups, loaded, options
@@ -62,9 +61,13 @@ def test_no_entry_stands_twice_and_each_is_of_a_key():
     assert {key for key in entries if not key.startswith("hydra.")} - used - unseen == set()
 
 
-def test_every_setting_of_a_run_is_in_a_group_that_is_decided_about():
+def test_every_setting_and_every_group_is_decided_about():
     settings = {key for key in flatten(composed("train")) if not names_a_class(key)}
     assert [key for key in settings if row_of(key) is None] == []
+    others = {"hydra", "logger", "output", "budgets", "viewer", "what"}
+    assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"}
+    for group in others:
+        assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group
 
 
 def test_a_room_that_is_trusted_as_a_whole_has_no_texts_but_words():
@@ -88,21 +91,10 @@ def texts_in(annotation):
     return [annotation]
 
 
-def test_every_group_is_one_that_a_file_may_choose_from_or_decidedly_none():
-    others = {"hydra", "logger", "output", "budgets", "viewer", "what"}
-    assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"}
-    for group in others:
-        assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group
-
-
-def test_a_new_reader_part_or_callback_has_the_row_of_its_group():
+def test_what_is_new_has_the_row_of_its_group_and_of_the_name_of_a_class_nothing_is_taken():
     assert meaning_of("scene.of_a_new_reader").trust is Trust.PLAIN
     assert meaning_of("scene.of_a_new_reader").learnt
     for key in ("field.of_a_new_field", "loss.terms.of_a_new_loss", "callbacks.mine.port", "trainer.unheard_of"):
         assert meaning_of(key).trust in (Trust.WORDS, Trust.PLAIN)
-    assert meaning_of("unheard_of").trust is Trust.NOTHING
-
-
-@pytest.mark.parametrize("key", ["model._target_", "scene._target_", "model.levels.fine._args_", "_target_.x"])
-def test_of_the_name_of_a_class_nothing_is_taken(key):
-    assert meaning_of(key).trust is Trust.NOTHING
+    for key in ("unheard_of", "model._target_", "scene._target_", "model.levels.fine._args_", "_target_.x"):
+        assert meaning_of(key).trust is Trust.NOTHING

@@ -27,7 +27,7 @@ def picture():
     return torch.rand(16, 20, 3, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.1
 
 
-def test_an_affine_change_of_colours_is_undone_by_the_fit_of_least_squares():
+def test_an_affine_change_of_colours_is_undone_by_least_squares_without_what_a_mask_leaves_out():
     truth, matrix = picture(), torch.tensor([[0.9, 0.1, 0.0], [0.0, 0.8, 0.1], [0.05, 0.0, 1.1]])
     render = (truth - 0.02) @ matrix.inverse()
     torch.testing.assert_close(color_corrected(render, truth), truth, atol=1e-5, rtol=0)
@@ -35,9 +35,6 @@ def test_an_affine_change_of_colours_is_undone_by_the_fit_of_least_squares():
     ones = torch.cat([render, torch.ones(16, 20, 1)], dim=-1).reshape(-1, 4)
     solved = ones @ torch.linalg.lstsq(ones.double(), truth.reshape(-1, 3).double()).solution.float()
     torch.testing.assert_close(color_corrected(render, truth).reshape(-1, 3), solved, atol=1e-5, rtol=0)
-
-
-def test_what_a_mask_leaves_out_is_not_fitted_and_flat_pictures_have_no_fit_to_lose():
     truth, kept = picture(), torch.zeros(16, 20, dtype=torch.bool)
     kept[4:12] = True
     render = (truth * 0.5).where(kept[..., None], 0.9)
@@ -47,15 +44,12 @@ def test_what_a_mask_leaves_out_is_not_fitted_and_flat_pictures_have_no_fit_to_l
     assert torch.equal(color_corrected(render, truth, torch.zeros_like(kept)), render)
 
 
-def test_a_picture_has_both_numbers_and_fitting_never_harms():
+def test_a_picture_has_both_numbers_fitting_never_harms_and_nothing_is_fitted_to_one_of_one_colour():
     truth = picture()
     found = image_metrics(scale_light(truth, GAINS), truth)
     assert found["psnr"] < 24 < found["cc_psnr"] - 10
     same = image_metrics(truth, truth)
     assert same["psnr"] == same["cc_psnr"] == 100.0
-
-
-def test_of_a_picture_of_one_colour_nothing_is_fitted():
     truth, flat, left = picture(), torch.full((16, 20, 3), 0.3), torch.zeros(16, 20, dtype=torch.bool)
     left[:, :10] = True
     assert image_metrics(flat, truth)["cc_psnr"] is image_metrics(truth, flat + 1e-4 * truth)["cc_psnr"] is None

@@ -41,14 +41,11 @@ def sphere(rays, radius=1.0):
     return points, hit
 
 
-def test_the_share_of_escaping_light_is_taken_out_of_the_depth():
+def test_depth_is_scored_without_escaping_light_and_where_the_scene_covers_the_pixel():
     opacity = torch.tensor([1.0, 0.5, 0.01, 0.0], dtype=torch.float64)
     depth = 2.5 * opacity + FAR * (1 - opacity)
     found = surface_depth(depth, opacity, torch.full_like(depth, FAR))
     torch.testing.assert_close(found, torch.tensor([2.5, 2.5, 2.5, FAR], dtype=torch.float64))
-
-
-def test_depth_is_scored_where_the_scene_covers_the_pixel():
     truth = torch.tensor([2.0, 2.0, 2.0, math.inf])
     opacity = torch.tensor([1.0, 0.5, 1.0, 0.0])
     depth = torch.tensor([2.5, 0.5 * 1.9 + 0.5 * FAR, 5.0, FAR])
@@ -98,7 +95,7 @@ def test_waves_of_the_depth_are_smoothed():
     assert normal_error(normals_from_depth(rough), truth, alpha) < 0.5 * normal_error(differences, truth, alpha)
 
 
-def test_beside_an_edge_a_normal_is_that_of_its_own_surface():
+def test_normals_are_their_own_surfaces_beside_an_edge_and_beside_a_pixel_without_a_point():
     rays = picture_rays(32, focal=60.0)
     normal = normalize(torch.tensor([0.5, -0.6, 0.2], dtype=torch.float64), dim=0)
     points = plane(rays, normal)
@@ -106,9 +103,6 @@ def test_beside_an_edge_a_normal_is_that_of_its_own_surface():
     facing = normal if float(rays.directions[8, 8] @ normal) < 0 else -normal
     found = normals_from_depth(points)[:, :16]
     assert float((found * facing).sum(dim=-1).min()) > math.cos(math.radians(2.0))
-
-
-def test_a_pixel_without_a_point_spoils_no_other():
     rays = picture_rays(16, focal=200.0)
     normal = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     points = plane(rays, normal)

@@ -67,7 +67,7 @@ def test_z_is_shorter_than_the_distance_beside_the_axis(tmp_path):
     np.testing.assert_allclose(z, along * cosine, rtol=1e-4)
 
 
-def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(tmp_path):
+def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered_and_so_is_none(tmp_path):
     """A checkpoint may say any size up to budgets.view_pixels."""
     scene = record_of_views()
     sizes = {"width": torch.full((4,), 1 << 40), "height": torch.ones(4, dtype=torch.int64)}
@@ -75,9 +75,6 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(t
     with pytest.raises(InputError, match=r"The view \w+ has 1099511627776 x 1 pixels .* Views of up to [\d,]+ pixels"):
         ImagesExport().export(solid(ball()), scene, tmp_path / "out", TILE)
     assert not (tmp_path / "out").exists()
-
-
-def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(InputError, match=r"what\.max_views=0"):
         ImagesExport(max_views=0)
 

@@ -97,11 +97,17 @@ def test_without_locks_the_process_tells_whether_a_writer_lives(tmp_path, monkey
     assert {file.name for file in tmp_path.iterdir()} == {"a.txt", other_machine, alive} | left
 
 
-def test_a_failed_block_leaves_what_was_there_and_a_full_disk_is_said_of_its_file(tmp_path):
+def test_a_failed_block_leaves_what_was_there_and_its_error_names_the_file(tmp_path):
     (tmp_path / "a.txt").write_text("former")
     with pytest.raises(OSError, match=r"No space left on device: .*/a.txt"):
         write_half(tmp_path / "a.txt")
     assert [file.read_text() for file in tmp_path.iterdir()] == ["former"]
+    with pytest.raises(OSError, match="broken") as caught, whole_file(tmp_path / "a.txt"):
+        raise OSError(errno.EIO, "broken")
+    assert caught.value.filename == str(tmp_path / "a.txt")
+    with pytest.raises(ConnectionRefusedError) as caught:
+        fail_in(tmp_path, ConnectionRefusedError(errno.ECONNREFUSED, "refused"))
+    assert caught.value.filename is None
 
 
 def test_a_file_that_another_process_has_open_is_replaced_once_it_is_closed(tmp_path, monkeypatch):
@@ -121,19 +127,6 @@ def test_a_file_that_another_process_has_open_is_replaced_once_it_is_closed(tmp_
     assert len(waits) == 2
 
 
-def test_what_is_refused_for_a_second_stays_refused(monkeypatch):
-    now = iter((0.0, 0.5, 0.9, 1.1))
-    monkeypatch.setattr(atomic.time, "monotonic", lambda: next(now))
-    monkeypatch.setattr(atomic.time, "sleep", lambda seconds: None)
-    with pytest.raises(PermissionError):
-        atomic.persistently(refuse, "a.txt")
-    assert list(now) == []
-
-
-def refuse(name):
-    raise PermissionError(errno.EACCES, "Access is denied", name)
-
-
 def write_half(path):
     with whole_file(path) as part:
         part.write_text("half")
@@ -151,15 +144,6 @@ def test_a_full_disk_is_said_of_what_is_written(tmp_path, number):
         with pytest.raises(OSError, match="full") as caught:
             fail_in(tmp_path, OSError(number, "full", *names))
         assert (caught.value.filename, caught.value.filename2) == (str(said), None)
-
-
-def test_whatever_befalls_a_file_is_said_of_it_and_of_no_other(tmp_path):
-    with pytest.raises(OSError, match="broken") as caught, whole_file(tmp_path / "a.txt"):
-        raise OSError(errno.EIO, "broken")
-    assert caught.value.filename == str(tmp_path / "a.txt")
-    with pytest.raises(ConnectionRefusedError) as caught:
-        fail_in(tmp_path, ConnectionRefusedError(errno.ECONNREFUSED, "refused"))
-    assert caught.value.filename is None
 
 
 def fail_in(folder, error):

@@ -6,10 +6,9 @@ from dataclasses import asdict
 
 import pytest
 from omegaconf import OmegaConf
-from support.configs import composed, loaded
+from support.configs import loaded
 from support.running import REPOSITORY
 
-from nerf_lightning.cli.main import find_commands
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, limits, require_within, set_limits
 from nerf_lightning.messages.errors import InputError
 
@@ -20,18 +19,10 @@ def _defaults_afterwards():
     set_limits(Budgets())
 
 
-def test_the_yaml_has_the_table_that_the_code_has():
+def test_the_yaml_and_the_page_on_security_have_the_table_that_the_code_has():
     assert OmegaConf.to_container(loaded("budgets", "default")) == asdict(Budgets())
-
-
-def test_the_page_on_security_has_it_too():
     rows = re.findall(r"`(\w+)` ([\d,]+)", (REPOSITORY / "SECURITY.md").read_text(encoding="utf-8"))
     assert {name: int(number.rstrip(",").replace(",", "")) for name, number in rows} == asdict(Budgets())
-
-
-@pytest.mark.parametrize("command", sorted(find_commands()))
-def test_every_command_has_it(command):
-    assert composed(command).budgets == asdict(Budgets())
 
 
 def test_a_limit_is_raised_by_what_is_typed_alone_and_what_is_too_much_is_said_with_its_setting():

@@ -95,12 +95,14 @@ def test_another_file_half_of_it_and_one_that_is_absent_are_told(server, target)
     refused(server.url, target, "HTTP Error 404: Not Found")
 
 
-def test_unreachable_port(monkeypatch, target):
+def test_a_port_that_nobody_serves_and_a_folder_that_cannot_be_made_are_told(monkeypatch, target, tmp_path):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{free.getsockname()[1]}/file.bin"
     refused(url, target, r"refused")
+    (tmp_path / "file").touch()
+    refused("https://example.invalid/a", tmp_path / "file" / "a", "exists")
 
 
 @pytest.mark.parametrize("url", ["http://example.invalid/a", "ftp://example.invalid/a", "file:///etc/hosts", "a"])
@@ -108,11 +110,6 @@ def test_only_https_is_trusted_without_a_checksum_and_http_with_one(target, url)
     refused(url, target, "is not an https address, which is needed without a checksum", sha256=None)
     if not url.startswith("http"):
         refused(url, target, "is not an https address")
-
-
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
-    (tmp_path / "file").touch()
-    refused("https://example.invalid/a", tmp_path / "file" / "a", "exists")
 
 
 def test_the_npz_reader_fetches_what_is_absent(server, tmp_path):

@@ -81,7 +81,7 @@ def test_a_larger_file_is_refused_before_it_is_read(tmp_path):
     open_regular(path, None).close()
 
 
-def test_regular_files_are_read_and_appended_to(tmp_path):
+def test_regular_files_are_read_and_appended_to_and_what_is_no_text_is_named(tmp_path):
     path = tmp_path / "it"
     for _ in range(2):
         with open_to_append(path) as file:
@@ -90,9 +90,6 @@ def test_regular_files_are_read_and_appended_to(tmp_path):
     assert read_text(path, "text") == "ü\n" * 2
     with open_regular(path, 8) as file:
         assert file.read() == path.read_bytes()
-
-
-def test_what_is_no_text_is_named(tmp_path):
     (tmp_path / "it").write_bytes(b"ab\xff")
     with pytest.raises(InputError, match=r"it is not a text file \(byte 2 is not UTF-8\)"):
         read_text(tmp_path / "it", "text")

@@ -1,6 +1,5 @@
 """PyTorch's files as plain containers and tensors, whatever their pickles make of themselves."""
 
-import os
 import pickle
 import struct
 import zipfile
@@ -10,7 +9,6 @@ import pytest
 import torch
 from support.planted import replace_pickle, write_checkpoint
 from support.running import refused
-from support.systems import POSIX
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
@@ -35,7 +33,7 @@ def altered(path, change, compression=zipfile.ZIP_STORED):
             archive.writestr(zipfile.ZipInfo(name), data, compression)
 
 
-def test_containers_and_tensors_are_made_anew(tmp_path):
+def test_containers_and_tensors_are_made_anew_and_what_is_shared_once(tmp_path):
     shared = (0.9, 0.99)
     state = Shadowed({"a": nn.Parameter(torch.ones(2)), "b": [Shadowed({"c": shared}), shared]})
     torch.save(state, tmp_path / "a.pt")
@@ -46,9 +44,6 @@ def test_containers_and_tensors_are_made_anew(tmp_path):
     assert not content["a"].requires_grad
     assert content["b"] == [{"c": shared}, shared]
     assert type(content["b"][0]) is dict
-
-
-def test_what_is_shared_is_made_once(tmp_path):
     """Fifty lists, each of which holds the one before twice, would else be 2^50."""
     whole = []
     for _ in range(50):
@@ -162,20 +157,11 @@ def test_instructions_that_weights_do_not_need_are_refused(tmp_path, instruction
     refused(read_checkpoint, path, parts=("a.ckpt",))
 
 
-def test_the_format_before_1_6_says_how_to_convert(tmp_path):
+def test_lists_in_lists_without_end_are_refused_and_the_format_before_1_6_with_how_to_convert_it(tmp_path):
     """A file of it can order any memory: a storage that its list of keys omits is never held against the file."""
     torch.save({"a": torch.ones(2)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
     refused(load_tensors, tmp_path / "a.pt", parts=("before version 1.6", "torch.save(torch.load('OLD'"))
-
-
-def test_lists_in_lists_without_end_are_refused(tmp_path):
     path = write_checkpoint(tmp_path / "a.ckpt")
     for endless_pickle in (b"]" * 20_000 + b"a" * 19_999, b"]q\x00h\x00a"):
         replace_pickle(path, b"\x80\x02" + endless_pickle + b".")
         refused(read_checkpoint, path, parts=("a.ckpt",))
-
-
-@POSIX
-def test_what_lies_in_the_place_of_a_checkpoint_is_named(tmp_path):
-    os.mkfifo(tmp_path / "last.ckpt")
-    refused(read_checkpoint, tmp_path / "last.ckpt", parts=("last.ckpt is a named pipe (FIFO)",))

@@ -19,10 +19,6 @@ TEMPLATE = {"w": torch.empty(2, 3, device="meta"), "n": [1, {"on": True}], "rate
 SOUND = {"w": torch.ones(2, 3), "n": [7, {"on": False}], "rate": 2.0, "none": None}
 
 
-def test_what_is_like_its_template_passes():
-    require_fit(SOUND, TEMPLATE, "file")
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -34,6 +30,7 @@ def test_what_is_like_its_template_passes():
     ids=lambda each: str(each)[:30],
 )
 def test_the_first_difference_from_a_template_is_named(change, words):
+    require_fit(SOUND, TEMPLATE, "file")
     with pytest.raises(Mismatch, match=words):
         require_fit(SOUND | change, TEMPLATE, "file")
     with pytest.raises(Mismatch, match="is missing"):

@@ -1,9 +1,6 @@
 """The commands on the GPU, each in a process of its own: train, resume, evaluate, render, export, view, self-test."""
 
 import json
-import re
-import signal
-import urllib.request
 
 import pytest
 import torch
@@ -127,23 +124,6 @@ def test_what_is_made_of_a_checkpoint(command, trained, trainer, tmp_path):
     name, *settings = command
     finished(start(name, f"ckpt={trained(trainer)}", *settings, trainer, f"paths.output_dir={tmp_path}"))
     assert any(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file())
-
-
-def test_view_serves_a_page_and_ends_cleanly(trained, trainer, tmp_path):
-    pytest.importorskip("viser", reason="the viewer needs viser")
-    process = start("view", f"ckpt={trained(trainer)}", trainer, "port=18190", f"paths.output_dir={tmp_path}")
-    lines = ""
-    for line in process.stdout:
-        lines += line
-        if found := re.search(r"The page is at (http://\S+)", line):
-            break
-    else:
-        raise AssertionError(lines)
-    with urllib.request.urlopen(found[1], timeout=60) as page:
-        assert b"<html" in page.read().lower()
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=120)
-    assert process.returncode in (0, 130)
 
 
 def test_two_runs_share_one_gpu(ball, trainer, tmp_path):

@@ -61,11 +61,18 @@ def test_what_makes_no_scene_is_told_in_words(images, changed, parts):
     refused(lambda: nl.scene_from_cameras(given, orbit_cameras(), **changed), parts=parts)
 
 
-def test_a_bad_camera_or_image_is_refused_and_not_left_out():
+def test_a_bad_camera_or_image_and_what_opencv_cannot_say_or_no_lens_here_has_is_refused():
     given, bad = orbit_images(6, SIZE), orbit_cameras()
     bad.c2w[3, 0, 0] = float("nan")
     refused(lambda: nl.scene_from_cameras(given, bad), parts=("view_0003", "NaN"))
     refused(lambda: nl.scene_from_cameras(given.astype(np.int32), orbit_cameras()), parts=("image 0", "int32", "uint8"))
+    skewed = MATRIX.clone()
+    skewed[0, 1] = 0.5
+    refused(lambda: nl.Cameras.from_opencv(orbit_poses(2), skewed, SIZE), parts=("skewed",))
+    refused(lambda: orbit_cameras(distortion=torch.full((8,), 0.01)), parts=("more than 5", "Undistort"))
+    ours = orbit_cameras(distortion=torch.zeros(4))
+    ours.lens[0, 3] = 0.1
+    refused(ours.to_opencv, parts=("k4",))
 
 
 @pytest.mark.parametrize("distortion", [None, [0.1, 0.02, 0.003, 0.004], [0.1, 0.02, 0.003, 0.004, 0.005]])
@@ -98,13 +105,3 @@ def test_a_point_is_seen_where_the_formulas_of_opencv_put_it():
     down = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
     expected = torch.tensor([14.0 * across + 6.0, 14.0 * down + 5.0])
     torch.testing.assert_close(project(ours, 2, point), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_what_opencv_cannot_say_or_no_lens_here_has_is_refused():
-    skewed = MATRIX.clone()
-    skewed[0, 1] = 0.5
-    refused(lambda: nl.Cameras.from_opencv(orbit_poses(2), skewed, SIZE), parts=("skewed",))
-    refused(lambda: orbit_cameras(distortion=torch.full((8,), 0.01)), parts=("more than 5", "Undistort"))
-    ours = orbit_cameras(distortion=torch.zeros(4))
-    ours.lens[0, 3] = 0.1
-    refused(ours.to_opencv, parts=("k4",))

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
 from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
-from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, embedded_video, write_report
+from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
 
 
 def decoded(picture):
@@ -17,7 +16,7 @@ def decoded(picture):
     return np.asarray(Image.open(io.BytesIO(content)))
 
 
-def test_small_pictures_are_kept_exactly_and_large_ones_shrunk():
+def test_small_pictures_are_kept_exactly_large_ones_shrunk_and_nothing_of_a_file_but_its_pixels(tmp_path):
     random = np.random.default_rng(0)
     picture = random.integers(0, 256, (30, 40, 3), dtype=np.uint8)
     assert (decoded(embedded(picture)) == picture).all()
@@ -25,27 +24,11 @@ def test_small_pictures_are_kept_exactly_and_large_ones_shrunk():
     wide = embedded(np.zeros((10, 2 * LONGEST_SIDE, 3), dtype=np.uint8))
     assert decoded(wide).shape == (5, LONGEST_SIDE, 3)
     assert not wide.is_small
-
-
-def test_nothing_of_a_file_but_its_pixels_comes_into_a_page(tmp_path):
     path = tmp_path / "a.png"
     Image.new("RGB", (8, 8), "red").save(path)
     path.write_bytes(path.read_bytes() + b"planted behind the end")
     content = base64.b64decode(embedded_file(path).source.partition(",")[2])
     assert b"planted" not in content
-
-
-def test_what_is_no_film_is_refused(tmp_path):
-    path = tmp_path / "a.mp4"
-    with pytest.raises(InputError, match="does not exist"):
-        embedded_video(path, 100)
-    path.write_bytes(b"<html>")
-    with pytest.raises(InputError, match="not an mp4"):
-        embedded_video(path, 100)
-    path.write_bytes(b"\0\0\0\x18ftypisom")
-    assert embedded_video(path, 100).startswith("data:video/mp4;base64,")
-    with pytest.raises(InputError, match="max_megabytes"):
-        embedded_video(path, 5)
 
 
 def test_known_curves_are_drawn_together_and_unknown_names_are_not():
@@ -85,14 +68,11 @@ def test_views_of_no_name_are_missing(tmp_path, name):
     assert len(missing) == 1  # it is among the worst, and is shown once
 
 
-def test_the_page_says_what_lpips_needs_where_it_was_not_computed():
+def test_the_page_says_how_many_views_were_measured_and_what_lpips_needs_where_it_was_not():
     protocol = {"protocol": {"split": "test"}}
     assert ("LPIPS", WITHOUT_LPIPS) in dict(tables(protocol | {"lpips": None}))["Protocol"]
     assert ("LPIPS", WITHOUT_LPIPS) not in dict(tables(protocol | {"lpips": 0.1}))["Protocol"]
     assert dict(tables({}))["Protocol"] == []
-
-
-def test_the_page_says_how_many_of_a_splits_views_were_measured():
     counts = {"num_images": 10, "split_views": 25}
     assert ("views measured", "10 of 25") in facts(counts, {})
     assert ("views measured", "25") in facts(counts | {"num_images": 25}, {})

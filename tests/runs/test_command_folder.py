@@ -24,14 +24,11 @@ def begun(wanted):
         raise InputError("refused")
 
 
-def test_what_was_made_and_stays_empty_is_removed(tmp_path):
+def test_what_was_made_and_stays_empty_is_removed_and_what_holds_something_or_was_there_stays(tmp_path):
     there = tmp_path / "there"
     there.mkdir()
     refused(begun, there / "a" / "b", parts=("refused",))
     assert list(there.iterdir()) == []
-
-
-def test_what_holds_something_and_an_empty_folder_that_was_there_stay(tmp_path):
     with filled_folder(None, tmp_path / "a" / "b") as folder:
         (folder / "written").write_text("")
     assert (tmp_path / "a" / "b" / "written").is_file()

@@ -63,12 +63,9 @@ def test_a_number_that_is_not_finite_is_never_hidden_by_others():
         relative(torch.ones(2), torch.ones(3))
 
 
-def test_bounds_grow_with_the_layers_and_with_what_products_leave_away():
+def test_bounds_grow_with_layers_and_with_rounding_which_stays_within_them(generator):
     for bound in (value_bound, gradient_bound):
         assert bound("float32", 3) < bound("tf32", 3) < bound("bfloat16", 3) < bound("bfloat16", 6) < 0.3
-
-
-def test_rounding_the_factors_of_products_stays_within_the_bounds(generator):
     """The formulas against perceptrons whose factors are rounded, with nothing of the kernels in between."""
     layers = 5
     weights = [(torch.randn(64, 64, generator=generator) / 32**0.5).double() for _ in range(layers)]

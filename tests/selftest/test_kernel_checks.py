@@ -16,14 +16,6 @@ CPU = torch.device("cpu")
 CHECKS = {check.name: check for check in checks(CPU, ("float32", "bfloat16"))}
 
 
-@pytest.mark.parametrize("name", CHECKS)
-def test_the_kernels_of_this_machine_are_right(name):
-    row = carried_out(CHECKS[name])
-    assert row.outcome == "ok", row
-    # A bound that is far above what rounding does would let mistakes through.
-    assert row.bound <= 0.25
-
-
 def larger(value):
     return tuple(map(larger, value)) if isinstance(value, tuple) else 1.01 * value
 

@@ -1,8 +1,5 @@
 """Small trainings: what is wrong on purpose is noticed, by the gradients or by the PSNR."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 
@@ -76,25 +73,3 @@ def test_an_optimizer_that_is_wrong_shows_in_the_psnr(monkeypatch):
 def test_gradients_that_are_missing_are_named():
     with pytest.raises(ValueError, match="gradients of \\['b'\\]"):
         training.gradients_apart({"a": torch.ones(1)}, {"a": torch.ones(1), "b": torch.ones(1)})
-
-
-COMPILED = """
-import torch
-from nerf_lightning.selftest import training
-
-compile_it = torch.nn.Module.compile
-torch.nn.Module.compile = lambda field, **how: compile_it(field, backend="eager", **how)
-for products in ("float32", "tf32", "bfloat16"):
-    torch._dynamo.reset()
-    made = training.Training("nerf_tiny", training.CPU, products, None)
-    assert made.train_step.objective.model.compile_fields()
-    made.gradients()
-print(dict(torch._dynamo.utils.counters["graph_break"]))
-"""
-
-
-@pytest.mark.exhaustive
-def test_a_compiled_field_is_one_program():
-    """In a process without the checks of shapes, which torch.compile does not look into."""
-    result = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True)
-    assert result.stdout == "{}\n", result.stdout + result.stderr[-2000:]

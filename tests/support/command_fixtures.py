@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.made_once import made_once
 from support.resumed import trained
-from support.running import FAST, FAST_PATH, NO_LAYOUT, start_cold
+from support.running import FAST, FAST_PATH, NO_LAYOUT, output_of, start_cold
 from support.scenes import ball_scene
 
 from nerf_lightning.cli import main as cli
@@ -77,9 +77,7 @@ def finished_run(tmp_path_factory, capture):
         steps = ("trainer.max_steps=20", f"paths.output_dir={folder}/run")
         # Most other runs of the tests are forks; this one is as whole as a person's.
         whole = [setting for setting in FAST if setting != NO_LAYOUT]
-        process = start_cold("nerf_lightning", "train", "scene=npz", f"scene.path={capture}", *whole, *steps)
-        output, _ = process.communicate(timeout=300)
-        assert process.returncode == 0, output
+        output = output_of(start_cold("nerf_lightning", "train", "scene=npz", f"scene.path={capture}", *whole, *steps))
         assert "Traceback" not in output
         assert "Exception ignored" not in output
         (folder / "run" / "output.txt").write_text(output)

@@ -4,9 +4,8 @@
 
 PLANS is a json list; each start of the program takes the next: `{"after": SECONDS}`, or `{"in": FUNCTION, "call": N}`
 for the N-th call of one of the functions that saving goes through, before, amid or after it, or `{"full": N}` for a
-disk that is full at the N-th save. `{"phase": "MODULE:FUNCTION", "after": SECONDS}` kills so long after a function is
-entered; without `after` it runs to the end, and FOLDER.seconds says how long that took. `{"largest": BYTES}` lets no
-file grow beyond that. `null` lets it run to the end. Prints a json list with what became of each start.
+disk that is full at the N-th save. `{"in": "MODULE:FUNCTION"}` kills when a function is entered. `{"largest": BYTES}`
+lets no file grow beyond that. `null` lets it run to the end. Prints a json list with what became of each start.
 """
 
 import contextlib
@@ -18,8 +17,6 @@ import os
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -80,26 +77,14 @@ def fill_disk(call: int) -> None:
     torch.save = save
 
 
-def at_phase(where: str, act: Callable[[], None]) -> None:
-    """Do something when a function is entered."""
+def die_in(where: str) -> None:
+    """Kill this process when it enters a function."""
     module, _, name = where.partition(":")
     *path, name = name.split(".")
     owner = importlib.import_module(module)
     for part in path:
         owner = getattr(owner, part)
-    real = getattr(owner, name)
-
-    def entered(*arguments, **options):
-        act()
-        return real(*arguments, **options)
-
-    setattr(owner, name, entered)
-
-
-def die_after(seconds: float) -> None:
-    """Let the system kill this process, whatever it is doing then; -SIGALRM is its exit code."""
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6))
+    setattr(owner, name, lambda *arguments, **options: die())
 
 
 def child(plan: dict | None, arguments: list[str], log: Path) -> None:
@@ -107,20 +92,18 @@ def child(plan: dict | None, arguments: list[str], log: Path) -> None:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     folder = next(argument.partition("=")[2] for argument in arguments if argument.startswith("paths.output_dir="))
-    if plan is not None and "in" in plan:
+    plan = plan or {}
+    if "call" in plan:
         arm(plan["in"], plan["call"], f"{folder}/checkpoints")
-    if plan is not None and "full" in plan:
+    elif "in" in plan:
+        die_in(plan["in"])
+    elif "full" in plan:
         fill_disk(plan["full"])
-    if plan is not None and "largest" in plan:
+    elif "largest" in plan:
         import resource  # not on Windows, where its places are collected
 
         resource.setrlimit(resource.RLIMIT_FSIZE, (plan["largest"], plan["largest"]))
-    entered: list[float] = []
-    if plan is not None and "phase" in plan and "after" in plan:
-        at_phase(plan["phase"], lambda: die_after(plan["after"]))
-    elif plan is not None and "phase" in plan:
-        at_phase(plan["phase"], lambda: entered.append(time.perf_counter()))
-    elif plan is not None and "after" in plan:
+    elif "after" in plan:
         threading.Timer(plan["after"], die).start()
     sys.argv = ["nerf", *arguments]
     code = 0
@@ -131,8 +114,6 @@ def child(plan: dict | None, arguments: list[str], log: Path) -> None:
     with contextlib.suppress(Exception):
         sys.stdout.flush()
         sys.stderr.flush()
-    if entered:
-        Path(f"{folder}.seconds").write_text(str(time.perf_counter() - entered[0]))
     os._exit(code)
 
 

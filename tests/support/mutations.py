@@ -10,37 +10,9 @@ from hypothesis.strategies import DrawFn
 from torch import Tensor
 
 VALUES: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        0,
-        -1,
-        2**53 + 1,
-        2**63,
-        10**400,
-        0.5,
-        1e-300,
-        1e39,
-        math.nan,
-        -math.inf,
-        [],
-        {},
-        [[]],
-        {"a": {"b": 1}},
-    ),
-    *(
-        "",
-        "..",
-        "../../elsewhere",
-        "/dev/zero",
-        "~nobody/x",
-        "a\0b",
-        "\ud800",
-        "\x1b[2J",
-        "a\nb",
-        "x" * 5000,
-        "9" * 5000,
-    ),
+    *(None, True, 0, -1, 2**53 + 1, 2**63, 10**400, 0.5, 1e-300, 1e39, math.nan, -math.inf, [], {}, [[]]),
+    *({"a": {"b": 1}}, "", "..", "../../elsewhere", "/dev/zero", "~nobody/x", "a\0b", "\ud800", "\x1b[2J", "a\nb"),
+    *("x" * 5000, "9" * 5000),
     *("<script>alert(1)</script>", "=cmd|' /C calc'!A0", "${oc.env:HOME}", "${", "{0}", "nan", "2001-99-99"),
 )
 KEYS = ("", "_target_", "frames", "near", "\ud800", "a.b", "<b>", "w", "psnr", "0")

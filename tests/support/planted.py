@@ -10,7 +10,7 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 from support.configs import composed
-from support.running import start_code
+from support.running import output_of, start_code
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
@@ -85,8 +85,5 @@ def peak_of(code: str, *arguments: object) -> tuple[int, list[str]]:
     before, after = code.split("# begin\n")
     measure = "peak = lambda: 1024 * int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])\n"
     whole = f"import sys\n{measure}{before}start = peak()\n{after}print('grown', peak() - start)\n"
-    process = start_code(whole, *arguments)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    *lines, grown = output.splitlines()
+    *lines, grown = output_of(start_code(whole, *arguments)).splitlines()
     return int(grown.split()[1]), lines

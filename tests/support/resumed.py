@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from support.running import FAST, start
+from support.running import FAST, output_of, start
 
 from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.config.compose import compose_config
@@ -18,10 +18,8 @@ SHORT = ("final.evaluate=false", "final.video=false", "trainer.precision=32-true
 
 def trained(folder: Path, capture: Path, *model: str) -> None:
     """Leave a run of 12 steps in folder/run."""
-    process = start("train", "scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=12",
-                    f"paths.output_dir={folder}/run")  # fmt: skip
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    place = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={folder}/run")
+    output_of(start("train", *place, *FAST, *model, *SHORT, "trainer.max_steps=12"))
 
 
 class Resumed:

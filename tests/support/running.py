@@ -96,6 +96,19 @@ def saved(folder: Path) -> dict:
     return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
 
 
+def output_of(process: subprocess.Popen | Forked) -> str:
+    """Wait for a process that does its work; return what it printed."""
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors or output
+    return output
+
+
+def done(result):
+    """Expect that a command did its work; return what it left."""
+    assert result.code == 0, result.err
+    return result
+
+
 def said(result, *parts: str) -> None:
     """Expect one paragraph with these words, exit code 2, and no traceback."""
     assert result.code == 2, result.err

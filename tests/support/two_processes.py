@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from support.running import start_code
+from support.running import output_of, start_code
 
 JOIN = """
 import sys
@@ -25,6 +25,5 @@ def in_two_processes(code: str, folder: Path) -> list[Any]:
     """Run code that knows its `rank` in two processes, and return the `result` of each."""
     processes = [start_code(JOIN + code + SAVE, str(rank), str(folder)) for rank in range(2)]
     for process in processes:
-        _, errors = process.communicate(timeout=300)
-        assert process.returncode == 0, errors
+        output_of(process)
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from support.configs import composed, options
+from support.configs import options
 from support.gpu_training import small, step_by_step
 from support.stand_in_device import StandInDevice
 
@@ -16,7 +16,6 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
 UPDATED = 4  # grids have been updated once
@@ -149,24 +148,3 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
         run = run_on(there, model, "bf16-mixed")
         step_and_render(there, run, named_waits(run.training.objective.model))
     assert all(kernel.launched >= STEPS for pair in kernels.values() for kernel in pair)
-
-
-@pytest.mark.parametrize("model", ["fast", "fast_small", "fast_large", "nerf_occupancy"])
-def test_arrays_of_samples_hold_twice_what_a_step_is_made_to_have(model):
-    with StandInDevice("cuda") as there:
-        budget = composed("train", f"model={model}").data.sample_budget
-        given = f"data.sample_budget={'null' if budget is None else budget}"
-        run = step_by_step(model, there.device, "32-true", None, *small(model), given)
-        (sampler,) = [part for part in run.training.objective.model.modules() if isinstance(part, OccupancySampler)]
-        pixels = run.loader.at(0, 0).pixels
-        few, many = (run.training.objective.rays(pixels.map(lambda each, n=n: each.repeat(n))) for n in (1, 1 << 13))
-        assert sampler.capacity_for(many) == (1 << 20 if budget is None else 2 * budget)
-        # No more than there are intervals, where those are fewer.
-        assert sampler.capacity_for(few) == 8 * (sampler.lattice.numel() - 2)
-        # Those of all samples in occupied cells, visible or not, are four times as large.
-        with torch.no_grad():
-            assert len(sampler(few, None).starts) == sampler.capacity_for(few)
-            sampler.capacity = 10
-            assert len(sampler(few, None).starts) == 4 * sampler.capacity_for(few) == 40
-            sampler.opaque_below = 0.0
-            assert len(sampler(few, None).starts) == 10

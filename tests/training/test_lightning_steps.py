@@ -50,7 +50,14 @@ def made_run(folder):
 
 
 def quiet(**settings):
-    return Trainer(**({"accelerator": "cpu", "enable_model_summary": False, "log_every_n_steps": 1} | settings))
+    silent = {"enable_model_summary": False, "enable_progress_bar": False, "logger": False, "log_every_n_steps": 1}
+    return Trainer(**({"accelerator": "cpu"} | silent | settings))
+
+
+def fit(trainer, system, data, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Lightning's advice about saving with manual optimization
+        trainer.fit(system, data, **options)
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +67,9 @@ def fitted(tmp_path_factory):
     run, bar, outputs = made_run(folder), Bar(), Outputs()
     callbacks = [bar, outputs, EarlyStopping("val/loss"), ModelCheckpoint(monitor="val/psnr", mode="max")]
     logger = CSVLogger(folder)
-    trainer = quiet(max_steps=3, val_check_interval=3, logger=logger, callbacks=callbacks, default_root_dir=folder)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Lightning's advice about saving with manual optimization
-        trainer.fit(run.system, run.data)
+    shown = {"enable_progress_bar": True, "logger": logger, "callbacks": callbacks}
+    trainer = quiet(max_steps=3, val_check_interval=3, default_root_dir=folder, **shown)
+    fit(trainer, run.system, run.data)
     return run, trainer, bar, outputs, folder
 
 
@@ -77,26 +83,25 @@ def test_losses_are_on_the_bar_and_in_lightnings_own_logger_and_validation_retur
     assert float(trainer.callback_metrics["train/loss"]) == pytest.approx(logged[-1])
     assert outputs.val
     assert all(float(each["psnr"]) == pytest.approx(-10 * torch.log10(each["loss"]).item()) for each in outputs.val)
-    (metrics,) = quiet(logger=False, enable_progress_bar=False).validate(run.system, run.data, verbose=False)
+    (metrics,) = quiet().validate(run.system, run.data, verbose=False)
     assert metrics["val/psnr"] == pytest.approx(float(trainer.callback_metrics["val/psnr"]))
     assert metrics["val/loss"] == pytest.approx(10 ** (-metrics["val/psnr"] / 10))
 
 
 def test_the_test_is_that_of_nerf_eval_and_rays_alone_are_no_picture_to_test(fitted, tmp_path):
     run, *_ = fitted
-    (metrics,) = quiet(logger=False, enable_progress_bar=False).test(run.system, run.data, verbose=False)
+    (metrics,) = quiet().test(run.system, run.data, verbose=False)
     with torch.no_grad():
         ours = Scoring().score(run.system.model, run.scene, run.scene.background, 8192, tmp_path)
     assert metrics["test/psnr"] == pytest.approx(ours["psnr"], abs=1e-4)
     assert metrics["test/cc_psnr"] == pytest.approx(ours["cc_psnr"], abs=1e-4)
-    trainer = quiet(logger=False, enable_progress_bar=False)
     with pytest.raises(nl.InputError, match=r"whole views.*datamodule=run\.data"):
-        trainer.test(run.system, dataloaders=run.data.val_dataloader(), verbose=False)
+        quiet().test(run.system, dataloaders=run.data.val_dataloader(), verbose=False)
 
 
 def test_predictions_are_pictures_of_the_test_views(fitted):
     run, *_ = fitted
-    pictures = quiet(logger=False, enable_progress_bar=False).predict(run.system, run.data)
+    pictures = quiet().predict(run.system, run.data)
     views = run.scene.splits["test"]
     assert len(pictures) == len(views)
     assert all(isinstance(picture, Picture) for picture in pictures)
@@ -113,7 +118,7 @@ def test_what_a_plain_trainer_saves_is_opened(fitted, weights_only):
         expected = run.system.model.eval().state_dict()
     assert all(torch.equal(value, expected[name]) for name, value in nl.load(path).module.state_dict().items())
     loaded = RadianceFieldSystem.load_from_checkpoint(path)
-    (metrics,) = quiet(logger=False, enable_progress_bar=False).test(loaded, run.data, verbose=False)
+    (metrics,) = quiet().test(loaded, run.data, verbose=False)
     assert metrics["test/psnr"] > 0
 
 
@@ -125,17 +130,13 @@ def test_what_a_subclass_of_somebody_saves_is_opened(tmp_path):
 
     other = made_run(tmp_path)
     system = Theirs(other.system.train_step, other.system.record)
-    trainer = quiet(max_steps=1, logger=False, enable_progress_bar=False, default_root_dir=tmp_path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        trainer.fit(system, other.data)
+    trainer = quiet(max_steps=1, default_root_dir=tmp_path)
+    fit(trainer, system, other.data)
     trainer.save_checkpoint(tmp_path / "theirs.ckpt")
     assert nl.load(tmp_path / "theirs.ckpt").checkpoint.step == 1
-    longer = quiet(max_steps=2, logger=False, enable_progress_bar=False, default_root_dir=tmp_path)
-    again = made_run(tmp_path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        longer.fit(Theirs(again.system.train_step, again.system.record), again.data, ckpt_path=tmp_path / "theirs.ckpt")
+    longer, again = quiet(max_steps=2, default_root_dir=tmp_path), made_run(tmp_path)
+    theirs = Theirs(again.system.train_step, again.system.record)
+    fit(longer, theirs, again.data, ckpt_path=tmp_path / "theirs.ckpt")
     assert longer.global_step == 2
 
 
@@ -151,15 +152,14 @@ class Hooks(Callback):
 
 
 def test_steps_of_a_trainer_of_ones_own_are_replayed(tmp_path):
-    losses, quietly = [], {"logger": False, "enable_progress_bar": False, "enable_checkpointing": False}
+    losses = []
     for records in (False, True):
         outputs, hooks = Outputs(), Hooks()
         with steps_on_tape() as replays, pytest.MonkeyPatch.context() as patch:
             patch.setattr(TrainerSettings, "records", lambda settings, train_step, records=records: records)
             run = made_run(tmp_path)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                quiet(max_steps=4, limit_val_batches=0, callbacks=[outputs, hooks], **quietly).fit(run.system, run.data)
+            more = {"callbacks": [outputs, hooks], "enable_checkpointing": False}
+            fit(quiet(max_steps=4, limit_val_batches=0, **more), run.system, run.data)
         assert len(replays) == 4 * records
         assert (hooks.updates, hooks.backwards > 0) == (4, not records)
         assert not run.system.train_step.gradients.replays  # a system can be copied

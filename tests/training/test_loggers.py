@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from support.captures import write_npz
 from support.configs import composed, options
-from support.running import FAST, refused
+from support.running import FAST, refused, start_code
 
 import nerf_lightning as nl
 from nerf_lightning.config.instantiate import build
@@ -47,12 +47,6 @@ def test_curves_are_kept_as_tables_of_each_start(trained):
     trained("logger=csv", "callbacks.monitor.every_steps=2", "resume=auto", "trainer.max_steps=6")
     assert rows(run.folder / "csv" / "version_0") == first
     assert [row["step"] for row in rows(run.folder / "csv" / "version_1") if row["train/loss"]] == ["6"]
-
-
-def test_a_short_run_has_rows_too(trained):
-    run = trained("logger=csv")
-    steps = [row["step"] for row in rows(run.folder / "csv" / "version_0") if row["train/loss"]]
-    assert steps == ["1", "2", "3", "4"]
 
 
 @pytest.mark.parametrize("option", options("logger"))
@@ -145,3 +139,39 @@ def test_mlflow_keeps_curves_settings_and_pictures(trained):
     assert found.info.status == "FINISHED"
     assert len(list((run.folder / "mlflow").rglob("step_*.png"))) == 2
     refused(MLflow(tracking_uri="nowhere://x").open, run.folder, "now", parts=("nowhere://x", "logger.mlflow.tracking"))
+
+
+# Fails from the given write, or the given flush, on, as a full disk does.
+RUN = """
+import errno, os, sys
+from nerf_lightning.cli import main as cli
+from tensorboard.summary.writer import record_writer
+
+what, first = sys.argv[1], int(sys.argv[2])
+real, calls = getattr(record_writer.RecordWriter, what), []
+
+def full(self, *arguments):
+    calls.append(1)
+    if len(calls) >= first:
+        raise OSError(errno.ENOSPC, "No space left on device")
+    return real(self, *arguments)
+
+setattr(record_writer.RecordWriter, what, full)
+sys.argv = ["nerf", *sys.argv[3:]]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("what", "first"), [("write", 12), ("flush", 2)])
+def test_is_one_paragraph(tmp_path, what, first):
+    capture = write_npz(tmp_path / "small.npz")
+    short = ("callbacks.monitor.every_steps=1", "trainer.max_steps=10", "final.evaluate=false", "final.video=false")
+    arguments = ("train", "scene=npz", f"scene.path={capture}", *FAST, *short, f"paths.output_dir={tmp_path}/run")
+    process = start_code(RUN, what, str(first), *arguments)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2, errors
+    assert "Traceback" not in errors
+    assert "Exception in thread" not in errors
+    (paragraph,) = [line for line in errors.splitlines() if line.startswith("nerf: ")]
+    assert "No space left on device. Check that the folder exists, is writable, and has free space." in paragraph
+    assert errors.splitlines()[-1] == paragraph

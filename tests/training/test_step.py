@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning.pytorch.trainer.states import TrainerFn, TrainerState
 from support.learnt_cameras import LearntShifts
 from support.scenes import ball_scene, tiny_model
+from support.stand_in_device import StandInDevice
 from support.steps import gradients, make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
@@ -17,7 +17,7 @@ from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.training.attempts import draw_weights, restart
 from nerf_lightning.training.gradients.tiles import Share
-from nerf_lightning.training.step_guard import first_not_finite
+from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -34,12 +34,9 @@ def test_a_tiled_step_equals_the_whole_step_up_to_rounding(tile_points, backgrou
     assert float(whole.norm()) > 0
 
 
-def test_clipping_scales_the_whole_gradient():
+def test_clipping_scales_the_whole_gradient_whose_norms_are_measured_before_for_each_level():
     gradient, _ = gradients(make_step(100, clip_norm=1e-3), ball_scene())
     assert abs(float(gradient.norm()) - 1e-3) < 1e-6
-
-
-def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they_are_clipped():
     clipped, whole = make_step(100, clip_norm=1e-3), make_step(100)
     scene = ball_scene()
     batch = RayBatches(scene, clipped.progress, 0, 64).at(0, 0)
@@ -69,24 +66,6 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     assert train_step.progress.step == 4
 
 
-def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
-    train_step = make_step(None)
-    with torch.no_grad():
-        train_step.objective.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    gradients(train_step, ball_scene(), steps=7)
-    assert train_step.guard.in_row == 7
-    assert train_step.guard.first_module.startswith("levels.fine.field.")
-    assert first_not_finite(train_step.objective.named_weights()) == "levels.fine.field.color_head"
-
-
-def test_a_run_that_starts_from_weights_restarts_from_them():
-    train_step = make_step(None)
-    weights = {name: torch.full_like(value, 0.25) for name, value in train_step.objective.model.named_parameters()}
-    train_step.start_weights = train_step.objective.model.state_dict() | weights
-    draw_weights(train_step)
-    assert all(bool((parameter == 0.25).all()) for parameter in train_step.objective.model.parameters())
-
-
 def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     states = []
     for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:
@@ -98,17 +77,6 @@ def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
     assert not torch.equal(states[0], states[3])
-
-
-def test_the_learning_rate_follows_the_schedule():
-    train_step = make_step(None)
-    train_step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
-    rates = []
-    loader, optimizer = RayBatches(ball_scene(), train_step.progress, 0, 16), train_step.new_optimizer()
-    for _ in range(4):
-        train_step(loader.at(0, 0), optimizer)
-        rates.append(optimizer.param_groups[0]["lr"])
-    assert rates == [0.5, 0.5, 0.25, 0.125]
 
 
 @pytest.fixture
@@ -135,7 +103,7 @@ def stingy_model(room):
     return model, tried
 
 
-def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thread):
+def test_without_memory_tiles_are_halved_until_a_single_ray_does_not_fit(caplog, one_thread):
     scene = ball_scene()
     wanted, losses = gradients(make_step(100_000), scene)
     model, tried = stingy_model(room=20)
@@ -145,9 +113,6 @@ def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thr
     assert tried[0] == 64
     assert tried[-1] <= 20
     assert "out of memory: reducing tiles to" in caplog.text
-
-
-def test_without_memory_for_a_single_ray_the_run_ends_with_advice():
     with pytest.raises(InputError, match="There is no memory"):
         gradients(make_step(100_000, model=stingy_model(room=0)[0]), ball_scene())
 
@@ -162,14 +127,6 @@ def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(capl
     assert tried[:3] == [144, 72, 36]
     assert max(tried[3:]) == 36
     assert caplog.text.count("from now on") == 2
-
-
-def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(monkeypatch):
-    model, compiled = tiny_model(), []
-    monkeypatch.setattr(torch.nn.Module, "compile", lambda module, **options: compiled.append((module, options)))
-    model.levels["coarse"].field.compiles = False
-    assert model.compile_fields() == ["fine"]
-    assert compiled == [(model.levels["fine"].field, {"dynamic": False})]
 
 
 def robust_step(tile_points, patch=4):
@@ -217,24 +174,6 @@ def test_weights_that_are_not_finite_are_not_saved():
         system.model.levels["fine"].field.color_head.bias[0] = float("inf")
     with pytest.raises(InputError, match=r"weights of step 7 are not finite.*optimizer\.lr"):
         system.on_save_checkpoint({})
-
-
-def test_validation_has_no_jitter():
-    system = RadianceFieldSystem(make_step(None), {})
-    logged = {}
-    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
-    fits = {"state": TrainerState(fn=TrainerFn.FITTING), "loggers": [logger], "global_step": 3}
-    system._trainer = type("T", (), {"sanity_checking": False} | fits)()
-    system.log_dict = lambda values, **options: None
-    loader = RayBatches(ball_scene(), system.train_step.progress, 0, 64)
-    values = []
-    for _ in range(2):
-        with torch.no_grad():
-            system.validation_step(loader.at(0, 0), 0)
-            system.on_validation_epoch_end()
-        values.append(dict(logged))
-    assert values[0] == values[1]
-    assert values[0]["val/psnr_standard_error"] > 0
 
 
 def a_step_with_shifts(tile_points=None, model=None, **settings):
@@ -330,3 +269,55 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
         [torch.zeros_like(each).flatten() if each.grad is None else each.grad.flatten() for each in plain.parameters()]
     )
     torch.testing.assert_close(gradients[1] - gradients[0], alone, atol=1e-4, rtol=1e-3)
+
+
+NAN, INFINITE = float("nan"), float("inf")
+GOOD = [1e-30, -0.0, -3.0]
+
+
+def parameters_with(device, *gradients):
+    for number, gradient in enumerate(gradients):
+        parameter = torch.nn.Parameter(torch.zeros(len(gradient), device=device))
+        parameter.grad = torch.zeros_like(parameter)
+        for place, value in enumerate(gradient):
+            parameter.grad[place] = value
+        yield f"part{number}.weight", parameter
+
+
+def steps_taken(guard, device):
+    """Whether each step is allowed, and the gradients that are left."""
+    for value in (1.0, NAN, -INFINITE, 1.0, INFINITE):
+        named = list(parameters_with(device, GOOD, [], [1.0, value], [value]))
+        losses = torch.full((2,), 0.5, device=device)
+        allowed = guard.allows(losses, named)
+        yield allowed, torch.cat([parameter.grad for _, parameter in named]).cpu()
+
+
+def test_on_the_cpu_steps_are_left_out_and_counted():
+    guard = StepGuard()
+    assert [allowed for allowed, _ in steps_taken(guard, torch.device("cpu"))] == [True, False, False, True, False]
+    assert guard.state() == [3, 1]
+    assert guard.first_module == "part2"
+
+
+@pytest.mark.parametrize("kind", ["cuda", "mps"])
+def test_elsewhere_their_gradients_become_zeros_and_others_keep_their_bits(kind):
+    guard = StepGuard()
+    with StandInDevice(kind) as there:
+        seen = list(steps_taken(guard, there.device))
+        assert guard.state() == [3, 1]
+        assert guard.first_module == "part2"
+    for number, (allowed, left) in enumerate(seen):
+        expected = torch.tensor([*GOOD, 1.0, 1.0, 1.0]) if number in (0, 3) else torch.zeros(6)
+        assert allowed
+        assert torch.equal(left.view(torch.int32), expected.view(torch.int32))
+
+
+@pytest.mark.parametrize("losses", [[NAN, 0.0], [0.0, INFINITE]])
+def test_a_loss_that_is_not_finite_is_the_first_where_no_gradient_shows_it(losses):
+    guard = StepGuard()
+    assert not guard.allows(torch.tensor(losses), parameters_with("cpu", GOOD))
+    assert guard.first_module == "loss"
+    assert guard.allows(torch.zeros(2), parameters_with("cpu", GOOD))
+    assert guard.allows(torch.zeros(2), parameters_with("cpu", GOOD, [1e38, -1e38]))
+    assert guard.state() == [1, 0]

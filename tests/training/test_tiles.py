@@ -9,8 +9,6 @@ from support.static_models import fast_model
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
-from nerf_lightning.nerf.kernels.hash_grid.op import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel, average_counts
 from nerf_lightning.nerf.part import fit_parts, sample_counts
 from nerf_lightning.training.fastest_tile import fastest
@@ -45,7 +43,7 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen, counts
 
 
-def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads):
+def test_beside_each_other_they_are_those_of_one_after_the_other_and_their_bits_the_same_every_time(model, threads):
     alone, seen_alone, counts_alone = gradients_of(model, 1, threads)
     beside, seen, counts = gradients_of(model, 3, threads)
     assert float(alone.norm()) > 0
@@ -53,9 +51,6 @@ def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads)
     torch.testing.assert_close(seen.losses, seen_alone.losses)
     torch.testing.assert_close(seen.foreground, seen_alone.foreground)
     assert torch.equal(counts, counts_alone)
-
-
-def test_their_bits_are_the_same_every_time(model, threads):
     first, *_ = gradients_of(model, 3, threads)
     for _ in range(5):
         assert torch.equal(gradients_of(model, 3, threads)[0], first)
@@ -65,22 +60,6 @@ def test_a_trainer_that_scales_the_loss_scales_the_gradients(model, threads):
     wanted, *_ = gradients_of(model, 2, threads)
     got, *_ = gradients_of(model, 2, threads, lambda loss: (4.0 * loss).backward())
     assert torch.equal(got, 4.0 * wanted)
-
-
-def test_the_gradients_of_a_table_can_be_held_back_and_added_later():
-    layout = hash_grid_layout(3, 8, 2, 16)
-    generator = torch.Generator().manual_seed(0)
-    table = torch.nn.Parameter(torch.rand(layout.offsets[-1], 2, generator=generator))
-    points = torch.rand(40, 3, generator=generator)
-    interpolate(table, points, layout).square().sum().backward()
-    wanted, table.grad = table.grad, None
-    with defer_table_grads() as held:
-        interpolate(table, points, layout).square().sum().backward()
-    assert table.grad is None
-    add_all(held)
-    assert torch.equal(table.grad, wanted)
-    add_all([*held, *held], scale=2.0)
-    torch.testing.assert_close(table.grad, 5.0 * wanted)
 
 
 @pytest.mark.parametrize(

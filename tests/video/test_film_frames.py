@@ -131,26 +131,6 @@ def test_two_processes_do_not_film_into_one_folder(tmp_path):
         opened(frames(tmp_path))
 
 
-def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch):
-    stop_after(tmp_path, 0, 1, 2, 3)
-    each, other = frames(tmp_path), frames(tmp_path)
-    opened(each)
-    release = each.scratch.release
-
-    def released():
-        release()
-        opened(other, fingerprint="b")  # at the first chance
-        other.save("video", 0, WRITE)
-
-    monkeypatch.setattr(each.scratch, "release", released)
-    each.finish(fps=4)
-    assert (tmp_path / ".frames" / "video" / "frame_0000.png").is_file()
-    with pytest.raises(InputError, match="in use by another process"):
-        opened(frames(tmp_path), fingerprint="b")
-    other.close()
-    assert opened(frames(tmp_path, films=("video",)), fingerprint="b")[0] == [1, 2, 3]
-
-
 def test_what_is_not_ours_is_neither_emptied_nor_filled(tmp_path):
     for theirs in (".frames/film.json", ".frames/chapters/1.tex", "other/video/frame_0000.png"):
         (tmp_path / theirs).parent.mkdir(parents=True, exist_ok=True)
@@ -195,7 +175,7 @@ def shown(output, normals=None):
     return panel(output, SEEN, (1.0, 3.0), 1.0, normals)
 
 
-def test_each_output_shows_what_it_says():
+def test_each_output_shows_what_it_says_and_depth_is_told_in_the_users_units():
     assert torch.equal(shown("rgb"), (RGB * 255).round().to(torch.uint8))
     assert shown("opacity")[0, 0].tolist() == [0, 0, 0]
     assert shown("opacity")[0, 29].tolist() == [255, 255, 255]
@@ -206,21 +186,12 @@ def test_each_output_shows_what_it_says():
     same = panel("levels", Picture(RGB, SEEN.depth, OPACITY, first_rgb=RGB), (1.0, 3.0), 1.0, None)
     assert len(same[:, :30].reshape(-1, 3).unique(dim=0)) == 1
     assert len(shown("levels")[:, :30].reshape(-1, 3).unique(dim=0)) > 1
-
-
-def test_depth_is_told_in_the_users_units():
     near = panel("depth", SEEN, (4.0, 6.0), 2.0, None)  # 2 scene units are 4 of the user's: as near as can be
     far = panel("depth", SEEN, (2.0, 4.0), 2.0, None)
     assert int(near[0, 29].sum()) > 600 > 100 > int(far[0, 29].sum())
 
 
-def test_one_model_has_a_film_for_each_output_unchanged():
-    films = film_pictures([{"rgb": shown("rgb"), "opacity": shown("opacity")}], [""], mosaic=False)
-    assert list(films) == ["video", "opacity"]
-    assert torch.equal(films["video"], shown("rgb"))
-
-
-def test_several_models_stand_side_by_side_under_their_names():
+def test_several_models_stand_side_by_side_under_their_names_or_in_rows_of_a_mosaic():
     panels = [{"rgb": shown("rgb")}, {"rgb": shown("rgb").flip(0)}]
     film = film_pictures(panels, ["a", "b"], mosaic=False)["video"]
     size = letter_size(20)
@@ -229,9 +200,6 @@ def test_several_models_stand_side_by_side_under_their_names():
     assert torch.equal(film[top : top + 20, edge + 30 + size : edge + 60 + size], shown("rgb").flip(0))
     other = film_pictures(panels, ["a", "other"], mosaic=False)["video"]
     assert not np.array_equal(film[:top], other[:top])
-
-
-def test_a_mosaic_has_a_column_for_each_output_and_a_row_for_each_model():
     panels = [{"rgb": shown("rgb"), "depth": shown("depth"), "opacity": shown("opacity")}] * 2
     one, two = film_pictures(panels[:1], ["a"], mosaic=True), film_pictures(panels, ["a", "b"], mosaic=True)
     assert list(one) == list(two) == ["mosaic"]

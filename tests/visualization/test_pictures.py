@@ -134,22 +134,12 @@ def ink(picture):
     return float((picture.float().mean(dim=-1) < 200).float().mean())
 
 
-def test_a_curve_has_the_size_that_was_asked_for():
-    picture = loss_curve(range(100), [1.0 / (i + 1) for i in range(100)], width=320, height=200)
-    assert picture.shape == (200, 320, 3)
-    assert picture.dtype == torch.uint8
-    assert 0.001 < ink(picture) < 0.2
-
-
-def test_the_axis_is_logarithmic():
+def test_the_axis_is_logarithmic_and_awkward_values_draw_without_a_warning():
     # An exponential decay is a straight line there: blue pixels lie about the diagonal.
     picture = loss_curve(range(200), [10 ** (-i / 50) for i in range(200)], width=400, height=400).float()
     rows, columns = torch.where((picture[..., 2] - picture[..., 0]) > 60)
     line = torch.stack([rows, columns]).double()
     assert torch.corrcoef(line)[0, 1] > 0.999
-
-
-def test_awkward_values_draw_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for values in ([], [0.1], [0.0, 0.0], [1.0, 0.0, float("nan"), float("inf"), 0.5], [float("nan")]):

@@ -77,9 +77,12 @@ def test_the_run_stops_and_says_step_module_and_last_good_checkpoint(tmp_path):
     assert last(tmp_path)["global_step"] == 10
 
 
-def test_without_a_checkpoint_it_says_so(tmp_path):
+def test_without_a_checkpoint_it_says_so_and_settings_that_make_no_sense_are_refused(tmp_path):
     with pytest.raises(InputError, match="No checkpoint was saved yet: begin anew with a smaller"):
         run(tmp_path, NanGuard(patience=4), step=2)
+    for settings, words in (({"factor": 1.5}, "nan_guard.factor=1.5"), ({"patience": 0}, "patience=0")):
+        with pytest.raises(InputError, match=words):
+            NanGuard(**settings)
 
 
 def test_a_few_bad_steps_are_left_out_and_no_more(tmp_path, caplog):
@@ -117,12 +120,9 @@ def test_a_rollback_goes_on_from_the_last_good_checkpoint_as_it_was_saved_at_a_l
         system = run(tmp_path, NanGuard(on_nan="rollback", patience=4), limit=0.006)
     assert seen == [(10, 160)]
     assert system.trainer.global_step == 30
-    assert (
-        system.train_step.progress.attempt,
-        system.train_step.progress.rollbacks,
-        system.train_step.progress.restarts,
-    ) == (1, 1, 0)
-    assert system.train_step.progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
+    progress = system.train_step.progress
+    assert (progress.attempt, progress.rollbacks, progress.restarts) == (1, 1, 0)
+    assert progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
     assert [group["lr"] for group in system.optimizers().param_groups] == [pytest.approx(0.005)]
     assert system.train_step.guard.state() == [4, 0]
     assert first_not_finite(system.train_step.objective.named_weights()) is None
@@ -135,9 +135,7 @@ def test_the_rate_falls_with_every_rollback_and_they_are_counted(tmp_path, caplo
     with pytest.raises(InputError, match="run stops") as stop:
         run(tmp_path, NanGuard(on_nan="rollback", patience=2, max_rollbacks=3))
     assert "on_nan=rollback" not in str(stop.value), "that has just been tried"
-    rates = [
-        record.getMessage().rpartition(" ")[2] for record in caplog.records if "Rolled back" in record.getMessage()
-    ]
+    rates = [message.rpartition(" ")[2] for message in caplog.messages if "Rolled back" in message]
     assert rates == ["0.005.", "0.0025.", "0.00125."], "each time from the same checkpoint, of the full rate"
 
 
@@ -177,9 +175,3 @@ def test_weights_that_are_not_finite_are_noticed_and_never_saved(tmp_path, caplo
     assert "The weights of step 14 are not finite numbers (first those of levels.coarse.field" in caplog.text
     assert first_not_finite(system.train_step.objective.named_weights()) is None
     assert system.train_step.progress.rollbacks == 1
-
-
-def test_settings_that_make_no_sense_are_refused():
-    for settings, words in (({"factor": 1.5}, "nan_guard.factor=1.5"), ({"patience": 0}, "patience=0")):
-        with pytest.raises(InputError, match=words):
-            NanGuard(**settings)

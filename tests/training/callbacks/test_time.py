@@ -135,16 +135,6 @@ def test_a_run_with_a_budget_is_never_at_its_estimated_end(monkeypatch, caplog):
     assert lines[-2:] == ["step 42/43 about 1 s left", "step 43/44 about 1 s left"]
 
 
-def test_a_schedule_is_fitted_only_once_time_was_measured(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    budget, system = TimeBudget(seconds=10.0, every_steps=1), a_system(step=1)
-    for used in (0.0, 2.0):
-        now[0] += 2.0
-        budget.on_train_batch_end(trainer(), system, None, None, 0)
-        assert budget.used == used
-
-
 @pytest.mark.parametrize("seconds", [0.0, float("nan"), float("inf")])
 def test_a_budget_that_is_no_time_is_refused(seconds):
     with pytest.raises(InputError, match=f"budget.seconds={seconds}: give a positive time"):

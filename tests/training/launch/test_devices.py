@@ -1,5 +1,6 @@
-"""Machines that we do not have: GPUs that cannot be used, CPUs that nobody knows, and which precision suits them."""
+"""Machines that we do not have: GPUs that cannot be used, unknown CPUs, TPUs, and which precision suits them."""
 
+import importlib.util
 import logging
 import platform
 import sys
@@ -7,16 +8,21 @@ import warnings
 
 import pytest
 import torch
+from support.configs import composed
 from support.scenes import tiny_model
-from support.static_models import fast_model
+from support.static_models import MODELS, fast_model
 
-from nerf_lightning.compute import devices, precision
+from nerf_lightning.compute import devices, precision, xla_device
 from nerf_lightning.compute.devices import working_device
+from nerf_lightning.compute.precision import choose_precision
 from nerf_lightning.config.error_messages import paragraph
 from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import matmul_precision
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.training.launch import xla
+from nerf_lightning.training.launch.processes import num_processes
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 CHOSEN = ("cuda", "Old GPU, found")
@@ -118,15 +124,12 @@ def products_of(model):
     return {level.field.matmul_precision for level in model.levels.values()}
 
 
-def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower(slow_bfloat16):
+def test_wide_layers_take_float32_where_bfloat16_is_slower_unless_it_was_asked_for_or_begun(slow_bfloat16, monkeypatch):
     settings = TrainerSettings(accelerator="cpu")
     assert products_of(settings.prepare(fast_model())) == {"bfloat16"}
     assert products_of(settings.prepare(tiny_model())) == {"float32"}
     assert (settings.precision, "slower for layers as wide as this model's" in settings.describe()) == ("32-true", True)
     assert products_of(settings.prepare(fast_model())) == {"bfloat16"}  # whatever was prepared before
-
-
-def test_what_was_asked_for_or_begun_stays(slow_bfloat16, monkeypatch):
     assert products_of(TrainerSettings(accelerator="cpu", precision="bf16-mixed").prepare(tiny_model())) == {"bfloat16"}
     resumed = TrainerSettings(accelerator="cpu")
     resumed.keep_precision("bf16-mixed")
@@ -151,13 +154,6 @@ def test_who_gains_by_bfloat16(name, native, amx, gains, monkeypatch):
     assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__() == gains
 
 
-def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch):
-    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: True)
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
-    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__()
-
-
 @pytest.mark.parametrize(("native", "used"), [(False, "32-true"), (True, "bf16-mixed")])
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
@@ -166,3 +162,33 @@ def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, beg
     assert precision.suited(*asked, "cuda", tiny_model())[0] == used
     said = ["trainer.precision=bf16-mixed: this device has no native bfloat16, so float32 is used instead."]
     assert caplog.messages == ([] if native or begun else said)
+
+
+@pytest.fixture
+def tpu(monkeypatch):
+    monkeypatch.setattr(xla_device, "require_device", lambda: "TPU")
+
+
+def test_a_missing_torch_xla_is_named_with_the_way_to_install_it_and_a_missing_tpu(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"torch_xla, which is not installed.*torch 2\.9.*make xla.*trainer=auto"):
+        TrainerSettings(accelerator=composed("train", "trainer=tpu").trainer.accelerator)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    monkeypatch.setattr(xla_device, "ACCELERATOR", type("None", (), {"is_available": staticmethod(lambda: False)}))
+    with pytest.raises(InputError, match="finds no TPU on this machine"):
+        TrainerSettings(accelerator="tpu")
+
+
+def test_a_tpu_takes_one_process_in_bfloat16_and_refuses_what_does_not_fit(tpu):
+    with pytest.raises(InputError, match=r"trainer\.compile=true.*XLA compiles"):
+        TrainerSettings(accelerator="tpu", compile=True)
+    with pytest.raises(InputError, match=r"launched_by=torchrun.*one process drives all cores"):
+        TrainerSettings(accelerator="tpu", launched_by="torchrun")
+    for model in MODELS.values():
+        xla.require_static_shapes(model())
+    with pytest.raises(InputError, match="model=fast_dense"):
+        xla.require_static_shapes(fast_model(RaggedLevel))
+    settings = TrainerSettings(accelerator="tpu", devices=8)
+    assert (settings.device_type, settings.precision, settings.measures_tile) == ("xla", "bf16-mixed", False)
+    assert choose_precision("32-true", "xla")[0] == "32-true"
+    assert num_processes(8, "xla") == num_processes("auto", "xla") == 1

@@ -6,7 +6,7 @@ from datetime import timedelta
 import pytest
 import torch
 from lightning import Trainer
-from lightning.pytorch.callbacks import EMAWeightAveraging, GradientAccumulationScheduler, Timer
+from lightning.pytorch.callbacks import EMAWeightAveraging, Timer
 from support.captures import write_npz
 from support.configs import composed
 from support.running import refused
@@ -16,10 +16,6 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.training import build_step
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.launch.fitting import require_deterministic
-
-
-def model_of(name):
-    return build(composed("train", f"model={name}").model)
 
 
 @pytest.fixture
@@ -43,20 +39,16 @@ def fitted(tmp_path):
 
 
 def test_nobody_promises_the_order_of_atomic_sums(run, monkeypatch):
-    require_deterministic(model_of("nerf_tiny"), "cuda")
-    require_deterministic(model_of("fast_small"), "cpu")
+    tiny, fast = (build(composed("train", f"model={name}").model) for name in ("nerf_tiny", "fast_small"))
+    require_deterministic(tiny, "cuda")
+    require_deterministic(fast, "cpu")
     parts = ("hash grids", "trainer.deterministic=true", "Trainer(deterministic=True)", "model=nerf")
-    refused(require_deterministic, model_of("fast_small"), "cuda", parts=parts)
+    refused(require_deterministic, fast, "cuda", parts=parts)
     asked = []
     monkeypatch.setattr(build_step, "require_deterministic", lambda model, device_type: asked.append(device_type))
     run()
     run("trainer.deterministic=true")
     assert asked == ["cpu"]
-
-
-def test_accumulation_by_a_schedule_is_refused_too(run, fitted):
-    parts = ("GradientAccumulationScheduler", "data.batch_rays")
-    refused(lambda: fitted(run(), max_steps=2, callbacks=GradientAccumulationScheduler({0: 2})), parts=parts)
 
 
 def test_a_time_that_the_learning_rate_does_not_follow_is_said_once_and_a_budget_is_followed(run, fitted, caplog):

@@ -42,11 +42,13 @@ def test_the_curve_through_the_keyframes_of_a_path_is_the_path(path):
     torch.testing.assert_close(curve.focal(at), wanted.focal[:, 0].float())
 
 
-def test_a_circle_ends_where_it_began():
+def test_a_circle_ends_where_it_began_and_one_camera_makes_no_path(tmp_path):
     found = as_keyframes(Orbit(60, fps=12), frame())
     assert found[0].position == found[-1].position
     assert found[-1].time == pytest.approx(5.0)
     assert as_keyframes(PhotographPath(60), frame())[-1].time == pytest.approx(59 / 30)
+    assert as_keyframes(Orbit(1), frame()) == []
+    assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
 
 
 def test_keyframes_of_a_file_stay_as_they_are(tmp_path):
@@ -71,12 +73,7 @@ def test_a_file_may_leave_out_what_a_player_needs(tmp_path):
     assert as_keyframes(KeyframePath(keys(tmp_path), fov=33.0), frame())[1].fov == pytest.approx(33.0, abs=1e-4)
 
 
-def test_one_camera_makes_no_path(tmp_path):
-    assert as_keyframes(Orbit(1), frame()) == []
-    assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
-
-
-def test_cameras_turn_away_step_over_the_plane_or_see_something():
+def test_a_forward_facing_capture_can_be_filmed_from_before_its_near_plane(tmp_path):
     # 90 degrees of view: turned by 40 its border still looks ahead, by 50 no longer.
     c2w = torch.eye(4)[:3].repeat(4, 1, 1)
     for view, degrees in enumerate((0.0, 40.0, 50.0)):
@@ -84,9 +81,6 @@ def test_cameras_turn_away_step_over_the_plane_or_see_something():
         c2w[view, :, :3] = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
     c2w[3, 2, 3] = -1.01
     assert in_front_of_near_plane(pinhole_cameras(c2w, 32.0, 64, 48)).tolist() == [True, True, False, False]
-
-
-def test_the_path_of_a_forward_facing_capture_can_be_filmed_and_a_circle_cannot(tmp_path):
     scene = read("llff", write_llff(tmp_path, Known(c2w=wall())), space="ndc")
     around = frame_of(scene.cameras, scene.aabb)
     assert bool(in_front_of_near_plane(AutoPath(num_frames=8).cameras(around)).all())

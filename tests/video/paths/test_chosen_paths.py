@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.geometry.cameras import project
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at, rotation_from_quaternion
 from nerf_lightning.nerf.geometry.world_frame import points_from_user, poses_from_user, similarity
 from nerf_lightning.video.paths.base import PathFrame
@@ -89,24 +88,13 @@ def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
         torch.testing.assert_close(found.focal, wanted.focal)
 
 
-def test_two_keyframes_are_a_straight_drive_that_looks_at_its_target(tmp_path):
-    file = keyframe_file(tmp_path, *(Keyframe((5.0, y, 0.0), look_at=(0.0, 0.0, 0.0)) for y in (0.0, 4.0)))
-    cameras = KeyframePath(file, 5).cameras(frame())
-    assert cameras.c2w[:, :, 3].tolist() == [[5, y, 0] for y in range(5)]
-    for view in range(5):
-        torch.testing.assert_close(project(cameras, view, torch.zeros(3).double()), cameras.center[view])
-
-
-def test_a_path_passes_the_photographs_as_they_were_taken():
+def test_a_path_passes_the_photographs_as_they_were_taken_and_is_smooth_where_it_closes():
     chosen = frame().poses[[0, 3, 4]]
     cameras = PhotographPath(2001, views=[0, "IMG_03*", 4]).cameras(frame())
     for pose in chosen:
         apart = (cameras.c2w - pose).abs().amax(dim=(-2, -1))
         assert float(apart.min()) < 5e-3
     torch.testing.assert_close(cameras.c2w[[0, -1]], chosen[[0, -1]])
-
-
-def test_a_closed_path_is_smooth_where_it_closes():
     eyes = PhotographPath(400, closed=True).cameras(frame()).c2w[:, :, 3]
     velocity = eyes.roll(-1, dims=0) - eyes
     change = (velocity.roll(-1, dims=0) - velocity).norm(dim=-1)

@@ -34,8 +34,6 @@ def test_what_is_written_is_read_back_and_a_file_by_hand_may_be_a_bare_list_of_w
 
 PLACES = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
 GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
-# Each line has twice the keys of the one before, and all of them are walked through while the file is read.
-MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n}, *a{n}]}}\n" for n in range(35))
 
 
 @pytest.mark.parametrize(
@@ -52,10 +50,6 @@ MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a number that is too large"),
-        ("[" * 5000, "it nests more than 50 deep"),
-        (MERGE_BOMB, r"it holds references \(\*name\)"),
-        ("- !!python/object/apply:os.system [ls]", "is not readable yaml"),
     ],
 )
 def test_a_bad_file_is_named(tmp_path, text, words):
@@ -67,12 +61,26 @@ def test_a_bad_file_is_named(tmp_path, text, words):
     assert len(str(caught.value)) < 1500
 
 
-def test_what_cannot_be_filmed_is_named(tmp_path):
+def test_what_cannot_be_filmed_or_without_end_or_swings_beyond_all_cameras_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none.yaml does not exist; the folder holds"):
         KeyframePath(str(tmp_path / "none.yaml"))
     file = keyframe_file(tmp_path, *(Keyframe((x, 0.0, 5.0), look_at=(x, 0.0, 4.0)) for x in (0.0, 1.0)))
     with pytest.raises(InputError, match="keyframe 1 looks straight along its up"):
         KeyframePath(file).cameras(frame())
+    keyframes = (Keyframe((x, 0.0, 5.0), look_at=(1.0, 2.0, 3.0), time=1000 * 3600 * x) for x in (0.0, 1.0))
+    file = keyframe_file(tmp_path, *keyframes)
+    with pytest.raises(InputError, match=r"3\.6e\+06 seconds, which makes 108,000,001 frames at path.fps=30"):
+        KeyframePath(file)
+    assert len(KeyframePath(file, num_frames=5).cameras(frame()).c2w) == 5
+    keys = [
+        "{position: [4, 0, 1], look_at: [0, 0, 0.5], fov: 40, time: -809}",
+        "{position: [0, 4, 2], look_at: [0, 0, 0.5], up: [0, 0, 1], time: 0.5}",
+        "{position: [-4, 0, 1], look_at: [0, 0, 0.5], fov: 22.6, time: 1}",
+    ]
+    (tmp_path / "keys.yaml").write_text("".join(f"- {key}\n" for key in keys))
+    scene = ball_scene()
+    with pytest.raises(InputError, match="swings beyond all cameras"):
+        KeyframePath(str(tmp_path / "keys.yaml")).cameras(frame_of(scene.cameras, scene.aabb))
 
 
 def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
@@ -108,24 +116,6 @@ def test_seconds_count_from_any_beginning(tmp_path, dtype, closed):
     assert torch.equal(late.focal, plain.focal)
 
 
-def test_keys_close_together_on_a_long_path_are_passed(tmp_path):
-    file = keyframe_file(
-        tmp_path,
-        *(Keyframe(p, look_at=(1.0, 2.0, 3.0), time=t) for p, t in zip(PLACES, (0.0, 1e9, 1e9 + 1), strict=True)),
-    )
-    around = replace(frame(), center=MIDDLE.float(), up=UP.float(), poses=frame().poses.float())
-    cameras = KeyframePath(file, num_frames=3).cameras(around)
-    torch.testing.assert_close(cameras.c2w[[0, 2], :, 3], torch.tensor(PLACES)[[0, 2]])
-
-
-def test_times_that_are_no_seconds_make_no_endless_film(tmp_path):
-    keyframes = (Keyframe((x, 0.0, 5.0), look_at=(1.0, 2.0, 3.0), time=1000 * 3600 * x) for x in (0.0, 1.0))
-    file = keyframe_file(tmp_path, *keyframes)
-    with pytest.raises(InputError, match=r"3\.6e\+06 seconds, which makes 108,000,001 frames at path.fps=30"):
-        KeyframePath(file)
-    assert len(KeyframePath(file, num_frames=5).cameras(frame()).c2w) == 5
-
-
 def test_what_all_keyframes_look_at_stays_in_the_middle(tmp_path):
     target = tuple(MIDDLE.tolist())
     file = keyframe_file(tmp_path, *(Keyframe(place, look_at=target) for place in PLACES))
@@ -155,6 +145,15 @@ def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots():
     torch.testing.assert_close(hermite(knots, values, at), (at**2 - 3 * at)[:, None])
 
 
+def test_a_quaternion_is_its_rotations():
+    generator = torch.Generator().manual_seed(0)
+    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
+    half_turns = torch.eye(4, dtype=torch.float64)
+    given = torch.cat([quaternions, half_turns])
+    found = quaternion_from_rotation(rotation_from_quaternion(given))
+    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
+
+
 def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():
     angle = torch.deg2rad(torch.tensor([0.0, 100.0, 200.0, 300.0], dtype=torch.float64))
     c, s, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
@@ -166,24 +165,3 @@ def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():
     steps = turned.diff().remainder(2 * math.pi)
     assert bool((steps < math.radians(25)).all())  # always forward, never the long way round
     torch.testing.assert_close(found[::10], rotations)
-
-
-def test_a_quaternion_is_its_rotations():
-    generator = torch.Generator().manual_seed(0)
-    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
-    half_turns = torch.eye(4, dtype=torch.float64)
-    given = torch.cat([quaternions, half_turns])
-    found = quaternion_from_rotation(rotation_from_quaternion(given))
-    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
-
-
-def test_times_so_uneven_that_the_field_of_view_swings_beyond_all_cameras(tmp_path):
-    keys = [
-        "{position: [4, 0, 1], look_at: [0, 0, 0.5], fov: 40, time: -809}",
-        "{position: [0, 4, 2], look_at: [0, 0, 0.5], up: [0, 0, 1], time: 0.5}",
-        "{position: [-4, 0, 1], look_at: [0, 0, 0.5], fov: 22.6, time: 1}",
-    ]
-    (tmp_path / "keys.yaml").write_text("".join(f"- {key}\n" for key in keys))
-    scene = ball_scene()
-    with pytest.raises(InputError, match="swings beyond all cameras"):
-        KeyframePath(str(tmp_path / "keys.yaml")).cameras(frame_of(scene.cameras, scene.aabb))

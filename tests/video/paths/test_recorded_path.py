@@ -109,7 +109,7 @@ def test_a_camera_whose_picture_has_no_top_is_refused_and_without_its_first_keyf
     assert filled.curve() is None
 
 
-def test_many_that_save_at_once_lose_nothing_and_no_link_is_written_through(tmp_path):
+def test_new_files_take_no_name_twice_follow_no_link_and_give_their_name_back_on_failure(tmp_path):
     (tmp_path / "a_002.txt").symlink_to(tmp_path / "elsewhere")
 
     def save(number):
@@ -120,9 +120,6 @@ def test_many_that_save_at_once_lose_nothing_and_no_link_is_written_through(tmp_
         list(pool.map(save, range(100)))
     assert sorted(int(file.read_text()) for file in tmp_path.iterdir() if not file.is_symlink()) == list(range(100))
     assert not (tmp_path / "elsewhere").exists()
-
-
-def test_what_could_not_be_written_gives_its_name_back(tmp_path):
     with pytest.raises(FileNotFoundError), new_file(tmp_path / "new", "a", ".txt") as path:
         path.with_name("other").rename(path)
     assert list((tmp_path / "new").iterdir()) == []

@@ -55,13 +55,10 @@ def test_no_frame_looks_where_no_photograph_does_and_none_is_rolled(name, path):
     assert float(near.max()) < 1.0
 
 
-def test_a_walk_is_steadier_than_the_photographs():
+def test_a_walk_is_steadier_than_the_photographs_and_passes_them_from_neighbor_to_neighbor():
     around = street(40, shake=0.3)
     heights = Walk(400, smooth=2.0).cameras(around).c2w[:, 2, 3]
     assert float(heights.std()) < 0.5 * float(around.poses[:, 2, 3].std())
-
-
-def test_photographs_in_no_order_are_passed_from_neighbor_to_neighbor():
     around = street()
     mixed = torch.randperm(20, generator=torch.manual_seed(3))
     assert walking_order(around.poses, 1.0).tolist() == list(range(20))
