@@ -63,19 +63,6 @@ def test_seed_zero_is_a_seed():
     assert len({fold(seed, 0, "weights") for seed in range(1000)}) == 1000
 
 
-def test_permute_carries_neighbours_far_apart():
-    size = 1_000_000
-    places = permute(torch.arange(4096), size, torch.full((4096,), fold(0, "rays")))
-    gaps = places.diff().abs().double()
-    assert abs(float(gaps.mean()) / size - 1 / 3) < 0.02  # as for independent uniform places
-
-
-def test_permute_of_another_key_is_another_order():
-    keys = [torch.full((512,), fold(0, 0, epoch)) for epoch in range(2)]
-    first, second = (permute(torch.arange(512), 512, key) for key in keys)
-    assert float((first == second).float().mean()) < 0.05
-
-
 @settings(max_examples=25, deadline=None)
 @given(size=st.integers(1, 1 << 20), key=st.integers(0, WORD))
 @example(size=1 << 20, key=0)

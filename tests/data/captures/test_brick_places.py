@@ -15,10 +15,9 @@ from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.base import frame_of
 
 PLACES = {
-    "outward from a wide ring": (lambda: outward_ring(1.0, seed=2), "transforms", "look"),
+    "outward from a ring": (lambda: outward_ring(1.0, seed=2), "transforms", "look"),
     "outward, close to the bricks": (lambda: outward_ring(2.0, seed=3), "colmap", "look"),
-    "through a bent corridor": (lambda: corridor(60.0, seed=5), "colmap", None),
-    "through a corridor, glancing aside": (lambda: corridor(0.0, 25.0, seed=6), "transforms", None),
+    "through a bent corridor, glancing aside": (lambda: corridor(60.0, 25.0, seed=5), "colmap", None),
 }
 """The place, the format, and what the doctor says of the cameras' directions."""
 

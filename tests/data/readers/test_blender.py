@@ -14,6 +14,7 @@ from nerf_lightning.nerf.geometry.cameras import focal_from_fov, project
 from nerf_lightning.nerf.geometry.world_frame import points_to_user
 
 COUNTS = {"train": 9, "val": 2, "test": 3}
+FISHEYE = {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}
 FRAME = {"file_path": "train/r_0", "transform_matrix": pose(0)}
 
 

@@ -217,17 +217,6 @@ def test_fields_that_the_kernel_does_not_know_take_the_plain_way():
     assert not other.takes_whole_rays(cpu, training=True, learns_cameras=False)
 
 
-def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
-    level, rays = a_level(ProposalLevel), some_rays(30)
-    level.learn_every, level.learn_always = 4, 0
-    monkeypatch.setattr(workspace, "_spare", [])
-    level.on_step(StepContext(0.0, 1, 0))
-    assert not level(rays, None, [], batch_random(0, 30)).weights.requires_grad
-    assert not workspace._spare
-    level.on_step(StepContext(0.0, 4, 0))
-    assert level(rays, None, [], batch_random(0, 30)).weights.requires_grad
-
-
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
 def test_the_first_rays_may_be_those_of_a_picture(mode, monkeypatch):
     monkeypatch.setattr(backends, "backend", backends.backend.__wrapped__)

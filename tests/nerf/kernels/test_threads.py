@@ -56,28 +56,6 @@ def test_torch_may_have_one_thread_while_work_is_shared_out():
     assert (torch.get_num_threads(), num_threads()) == (2, 2)
 
 
-def test_the_calling_thread_takes_parts_as_well():
-    both = threading.Barrier(2, timeout=10)  # each of two parts waits for the other
-
-    def meet(part):
-        both.wait()
-        return threading.get_ident()
-
-    assert threading.get_ident() in in_parallel(meet, range(2))
-
-
-def test_after_a_failure_no_further_part_is_taken():
-    taken = []
-
-    def fail(part):
-        taken.append(part)
-        raise ValueError(part)
-
-    with pytest.raises(ValueError, match=r"0|1"):
-        in_parallel(fail, range(100))
-    assert len(taken) <= 2
-
-
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])
 def test_gradients_are_kept_in_a_part_where_they_are_outside(mode):
     with mode():
