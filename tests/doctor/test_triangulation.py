@@ -59,8 +59,6 @@ def test_what_a_capture_knows_itself_stays(bricks):
     [
         ("contracted", ("model=auto",), True),
         ("contracted", ("model=auto", "loss=proposal"), False),
-        ("contracted", ("model=fast_proposal",), False),
-        ("contracted", ("model=fast_proposal", "loss=depth"), True),
         ("bounded", ("model=auto",), False),
     ],
 )

@@ -28,7 +28,6 @@ def turned(degrees, axis):
 @pytest.mark.parametrize(
     ("scale", "rotation", "shift"),
     [
-        (1.0, turned(30, [0, 0, 1]), [0.0, 0.0, 0.0]),
         (0.01, turned(90, [1, 0, 0]), [5.0, -3.0, 1.0]),
         (120.0, turned(200, [1, 2, 3]), [900.0, 20.0, -70.0]),
         (1.0, turned(180, [1, 0, 0]), [0.0, 0.0, 0.0]),

@@ -171,15 +171,12 @@ def test_what_is_not_a_number_is_not_hidden():
 
 
 @pytest.mark.parametrize("kind", [DenseLevel, ProposalLevel])
-def test_threads_share_rays_out_and_each_number_of_them_has_its_bits(kind):
+def test_threads_share_rays_out_and_each_number_of_them_has_its_bits(kind, set_threads):
     level, rays, grads = a_level(kind, contraction=True), some_rays(600), torch.randn(600, 15)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 2):
-            torch.set_num_threads(threads)
-            found.append(learnt(level, rays, None, grads, torch.zeros(600, 3)))
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 2, 2):
+        set_threads(threads)
+        found.append(learnt(level, rays, None, grads, torch.zeros(600, 3)))
     (one, of_one), (two, of_two), (again, of_again) = found
     assert torch.equal(one, two)
     assert torch.equal(two, again)

@@ -11,11 +11,8 @@ from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, over_r
 
 
 @pytest.fixture(autouse=True)
-def two_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+def two_threads(set_threads):
+    set_threads(2)
 
 
 def threads_of_parts(_=None):
