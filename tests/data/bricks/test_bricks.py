@@ -64,20 +64,6 @@ def test_interval_agrees_with_marching_the_distance(name: str) -> None:
     np.testing.assert_allclose(solid.distance(leaving[:, hit], size), 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", SIZES)
-def test_normal_is_the_gradient_of_the_distance(name: str) -> None:
-    solid, numbers = SIZES[name]
-    origins, directions = random_rays(300)
-    sizes = np.repeat(np.array(numbers)[:, None], 300, axis=1)
-    entry, exit = solid.interval(origins, directions, sizes)
-    hit = entry < exit
-    points, sizes = (origins + np.where(hit, entry, 0) * directions)[:, hit], sizes[:, hit]
-    normals = solid.normal(points, sizes)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1, atol=1e-9)
-    np.testing.assert_allclose(solid.distance(points + 1e-3 * normals, sizes), 1e-3, atol=1e-6)
-    assert (np.sum(normals * directions[:, hit], axis=0) < 0).all()
-
-
 def test_truth_lies_on_the_surface_and_faces_the_camera(scene: Scene, tracer: Tracer) -> None:
     for view in range(6):
         pixels = all_pixels(scene.cameras, view).map(lambda x: x.reshape(-1))

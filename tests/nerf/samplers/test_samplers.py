@@ -23,13 +23,6 @@ def coarse_rendering(rays, density_at):
     return composite(FieldOutput(density, torch.zeros(*density.shape, 3)), samples, rays, torch.ones(3))
 
 
-def test_at_evaluation_samples_are_the_midpoints_of_equal_intervals():
-    """The fault: validation that is jittered."""
-    rays = some_rays(3)
-    samples = StratifiedSampler(4)(rays, [], None)
-    torch.testing.assert_close(samples.midpoints, torch.tensor([2.5, 3.5, 4.5, 5.5]).expand(3, -1))
-
-
 def test_jitter_is_fresh_for_every_ray_and_step():
     """The fault: one jitter for all rays, or drawn once."""
     rays, sampler = some_rays(50), StratifiedSampler(16)
