@@ -3,7 +3,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from nerf_lightning.nerf.randomness import WORD, batch_random, fold, mix, permute
+from nerf_lightning.nerf.randomness import WORD, batch_random, fold, permute
 
 ORDER_OF_432 = [317, 91, 319, 240, 180, 357]
 ORDER_OF_TEN_TRILLION = [195157302707, 2420648577527, 2810723090951, 9025858086244]
@@ -49,13 +49,6 @@ def test_normal_numbers_have_mean_zero_and_variance_one():
     numbers = batch_random(fold(1), 4096).normal("noise", 16)
     assert abs(float(numbers.mean())) < 0.02
     assert abs(float(numbers.var()) - 1.0) < 0.03
-
-
-def test_mix_is_a_bijection_on_a_sample():
-    words = torch.arange(1 << 18) * 16381 % (1 << 32)
-    assert mix(words).unique().numel() == words.numel()
-    assert int(mix(words).min()) >= 0
-    assert int(mix(words).max()) < 1 << 32
 
 
 def test_seed_zero_is_a_seed():

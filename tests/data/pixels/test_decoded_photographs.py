@@ -188,21 +188,6 @@ def test_a_file_larger_than_memory_is_mapped(tmp_path):
     assert store.view(count - 1)[-1, -1].tolist() == [0, 0, 0, 0]
 
 
-@pytest.mark.parametrize("verify", [False, True])
-def test_a_large_store_is_compared_with_its_checksum_only_where_it_is_asked_for(
-    tmp_path, cache, decoded, monkeypatch, verify
-):
-    Image.fromarray(picture(0, 512, 512)).save(tmp_path / "a.png")  # larger than the spots together
-    read([Photograph(tmp_path / "a.png")], cache, verify=True)
-    monkeypatch.setattr(pixel_file, "CHECKED_WHOLE", 1000)
-    (path,) = cache.glob("*.pixels")
-    content = bytearray(path.read_bytes())
-    content[5000] ^= 1  # between two spots
-    path.write_bytes(content)
-    read([Photograph(tmp_path / "a.png")], cache, verify=verify)
-    assert len(decoded) == 1 + verify
-
-
 def test_a_failed_reader_leaves_nothing_and_a_killed_one_nothing_that_is_believed(capture, cache):
     sound = capture[0].path.read_bytes()
     capture[0].path.write_bytes(sound[: len(sound) * 2 // 3])  # its header is whole
