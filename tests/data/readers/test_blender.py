@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.captures import FOV, picture, pose, real_capture, write_blender, write_transforms
+from support.captures import FOV, picture, pose, write_blender, write_transforms
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.messages.errors import InputError
@@ -188,6 +188,7 @@ def test_names_what_a_wrong_folder_holds(tmp_path):
         ({}, r"lacks frames; it has nothing. The Blender format needs", None),
         ({"camera_angle_x": 1, "frames": [7]}, r"frames\[0\] must be a json object", 12),
         ({"frames": [FRAME]}, r"frames\[0\] \(train/r_0\) has no focal length: neither fl_x", 12),
+        ({"camera_angle_x": 1, "frames": [FRAME | FISHEYE]}, r"has another kind of lens \(fisheye\) than most", 11),
     ],
 )
 def test_a_file_of_another_shape_is_refused_and_a_view_that_cannot_be_used_left_out(
@@ -223,13 +224,3 @@ def test_images_of_another_size_are_left_out(root, caplog):
     Image.fromarray(picture(0, 6, 4)).save(root / "val" / "r_1.png")
     assert len(BlenderReader(str(root)).read().view_names) == 13
     assert re.search(r"must all have one size. Most are 8 x 8, but \S+val/r_1.png is 6 x 4. Render", caplog.text)
-
-
-@pytest.mark.data
-def test_reads_the_lego_of_200_pixels():
-    scene = BlenderReader(str(real_capture("lego_200"))).read()
-    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 100, "val": 20, "test": 25}
-    assert scene.cameras.focal[0, 0].item() == pytest.approx(277.7778, abs=1e-3)
-    assert scene.cameras.c2w[:, :, 3].norm(dim=-1).tolist() == pytest.approx([4.0311] * 145, abs=1e-3)
-    assert len(set(scene.view_names)) == 145
-    assert re.fullmatch(r"test/r_\d+", scene.view_names[-1])
