@@ -138,11 +138,6 @@ def test_it_samples_where_the_proposal_saw_something_and_a_little_elsewhere(rand
     assert bool(((samples.edges >= 2.0) & (samples.edges <= 6.0)).all())
 
 
-def test_proposals_need_a_level_before_them():
-    with pytest.raises(ValueError, match="needs a level before"):
-        ProposalSampler(8).num_samples_after(0)
-
-
 def test_without_an_end_it_spreads_its_samples_in_disparity():
     rays = replace(some_rays(30), near=torch.full((30,), 0.1), far=torch.full((30,), 100.0))
     stratified = StratifiedSampler(64)
