@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.configs import composed, options
 from support.scenes import tiny_field
 
 import nerf_lightning
-from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.types.rays import Points
 
@@ -72,14 +70,6 @@ def under_autocast_and_not(call) -> list:
         plain = call()
         with torch.autocast("cpu", torch.bfloat16):
             return [plain, call()]
-
-
-@pytest.mark.parametrize("option", options("encoder"))
-def test_an_encoder_is_the_same_under_autocast(option):
-    encoder, points = build(composed("train", f"encoder={option}").encoder), torch.rand(40, 3)
-    plain, lowered = under_autocast_and_not(lambda: encoder(points))
-    assert plain.dtype == lowered.dtype
-    assert torch.equal(plain, lowered)
 
 
 def test_an_mlp_and_metrics_are_the_same_under_autocast():

@@ -1,16 +1,12 @@
 """The precision of a product is what it is asked to be, forward and backward, and nothing around it changes it."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 import torch
 from support.running import start_code
 from torch.nn import functional
 
 from nerf_lightning.nerf import matmul_precision
-from nerf_lightning.nerf.matmul_precision import ROUND_ROWS, TILE_ROWS, disable_autocast, linear, pad_rows
+from nerf_lightning.nerf.matmul_precision import ROUND_ROWS, TILE_ROWS, disable_autocast, linear
 
 # A factor that is rounded to bfloat16 (7 bits behind the leading one) is wrong by 2^-8 of itself at most; a product of
 # two, summed over many terms of either sign, by less than twice that of the sum's own size.
@@ -63,26 +59,11 @@ def test_a_cpu_without_bfloat16_rounds_where_one_with_it_does(monkeypatch):
         assert off(native, emulated.double()) < 2**-10  # sums in another order, seldom rounded to another number
 
 
-def test_a_cpu_that_may_not_use_what_it_has_counts_as_one_without():
-    ask = "from nerf_lightning.nerf import matmul_precision; print(matmul_precision.cpu_multiplies_bfloat16())"
-    narrow = os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}
-    ran = subprocess.run([sys.executable, "-c", ask], env=narrow, capture_output=True, text=True)
-    assert ran.stdout.strip() == "False", ran.stderr
-
-
 def test_float32_is_torchs_own_to_the_bit():
     features, (weight, bias) = torch.randn(9, 5, 48), layer()
     ours = gradients(lambda *x: linear(*x, "float32"), features, weight, bias)
     for found, expected in zip(ours, gradients(functional.linear, features, weight, bias), strict=True):
         assert torch.equal(found, expected)
-
-
-def test_rows_come_in_few_sizes_and_what_is_added_is_zero():
-    sizes = {pad_rows(torch.ones(count, 2), torch.bfloat16).shape[0] for count in range(1, TILE_ROWS + 1)}
-    assert len(sizes) == TILE_ROWS // ROUND_ROWS + 3
-    padded = pad_rows(torch.ones(70, 2), torch.bfloat16)
-    assert torch.equal(padded, torch.cat([torch.ones(70, 2), torch.zeros(58, 2)]).bfloat16())
-    assert pad_rows(torch.ones(70, 2), torch.float32).shape == (70, 2)
 
 
 @pytest.mark.parametrize("asked", ["float32", "tf32", "bfloat16"])

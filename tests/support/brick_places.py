@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from support.posed_captures import READERS, Known, write_colmap, write_llff, write_transforms
+from support.posed_captures import READERS, Known, write_colmap, write_transforms
 
 from nerf_lightning.data.bricks.light import DAY
 from nerf_lightning.data.bricks.parts import GREY, Material, Part, block
@@ -57,10 +57,7 @@ class Place:
         names = tuple(f"{number:03d}.png" for number in range(len(self.c2w)))
         known = Known(self.c2w, names, (SIZE, SIZE), (FOCAL, FOCAL), (SIZE / 2, SIZE / 2), self.points())
         known = known.moved(1.0 / unit, np.eye(3), np.array(origin))
-        if kind == "llff":
-            write_llff(root, known, near=float(self.distance.min()) / unit)
-        else:
-            {"colmap": write_colmap, "transforms": write_transforms}[kind](root, known)
+        {"colmap": write_colmap, "transforms": write_transforms}[kind](root, known)
         for name, picture in zip(names, self.pictures, strict=True):
             Image.fromarray(picture).save(root / "images" / name)
         return READERS[kind](root=str(root), cache_dir=str(root.parent / "cache")).read()

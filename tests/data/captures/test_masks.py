@@ -8,12 +8,11 @@ import torch
 from support.scenes import ball_scene, tiny_model
 from support.steps import gradients, make_step
 
-from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.protocol import split_hash
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.collapse_guard import is_constant
@@ -31,27 +30,6 @@ def garbled(scene):
     rgba = scene.pixels.rgba.clone()
     rgba[scene.pixels.mask == 0] = torch.tensor([255, 0, 255, 255], dtype=torch.uint8)
     return replace(scene, pixels=replace(scene.pixels, rgba=rgba))
-
-
-class PlainMean(MeanSquaredError):
-    """The loss without weights."""
-
-    def forward(self, renderings, target):
-        assert float(target.weight.mean()) == 1.0
-        return {"color": torch.stack([(rendering.rgb - target.rgb).square().mean() for rendering in renderings])}
-
-
-@pytest.mark.parametrize("tile_points", [None, 100])
-def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(tile_points):
-    model = tiny_model(density_bias=0.5)
-    plain_step = make_step(tile_points, copy.deepcopy(model))
-    plain_step.objective.loss = PlainMean()
-    plain, losses = gradients(plain_step, ball_scene())
-    weighted, weighted_losses = gradients(make_step(tile_points, copy.deepcopy(model)), ball_scene())
-    assert torch.equal(weighted, plain)
-    assert torch.equal(weighted_losses, losses)
-    keep_all = masked(ball_scene(), lambda number: number >= 0)
-    assert torch.equal(gradients(make_step(tile_points, copy.deepcopy(model)), keep_all)[0], plain)
 
 
 def test_the_loss_is_the_mean_over_unmasked_pixels():
@@ -88,13 +66,6 @@ def test_a_batch_of_masked_pixels_alone_has_no_gradient():
     gradient, losses = gradients(make_step(None), masked(ball_scene(), lambda number: number < 0))
     assert float(gradient.abs().max()) == 0
     assert losses.tolist() == [0.0, 0.0]
-
-
-def test_gathering_gives_masked_pixels_no_weight():
-    scene = masked(ball_scene(), lambda number: number % 5 > 1)
-    pixels = PixelDomain(scene, scene.splits["train"]).locate(torch.arange(20))
-    assert gather_batch(scene, pixels).weight.tolist() == [float(number % 5 > 1) for number in range(20)]
-    assert gather_batch(ball_scene(), pixels).weight.tolist() == [1.0] * 20
 
 
 def validation_psnr(scene):

@@ -15,7 +15,6 @@ from nerf_lightning.data.pixels.plain_background import cut_out, plain_color
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.nerf.rendering.background import blend
 from nerf_lightning.nerf.types.scene import UNSURE
 
 WIDTH, HEIGHT, VIEWS = 40, 30, 8
@@ -63,13 +62,6 @@ def test_what_hangs_together_with_the_edge_is_made_transparent(color, noise):
         assert np.array_equal(alpha == 255, inner)
         assert (alpha[(ring_ | hole) & ~inner] == UNSURE).all()
     assert torch.equal(cut.rgba[:, :3], before[:, :3])
-
-
-def test_over_the_same_colour_photographs_look_as_before():
-    store = store_of(pictures())
-    before = store.rgba[:, :3].float() / 255
-    cut, _ = cut_out(store, "rings", wanted=True)
-    torch.testing.assert_close(blend(cut.rgba.float() / 255, torch.ones(1, 3)), before, rtol=0, atol=1 / 255)
 
 
 @pytest.mark.parametrize("name", ["noisy", "wanted", "alpha", "masks", "edges of many colors", "a thin margin"])

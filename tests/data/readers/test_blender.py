@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.captures import FOV, picture, pose, real_capture, write_blender, write_transforms
+from support.captures import FOV, picture, pose, write_blender, write_transforms
 
 from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, project
 from nerf_lightning.nerf.geometry.world_frame import points_to_user
 
 COUNTS = {"train": 9, "val": 2, "test": 3}
+FISHEYE = {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}
+FRAME = {"file_path": "train/r_0", "transform_matrix": pose(0)}
 
 
 @pytest.fixture
@@ -126,17 +129,6 @@ def test_photographs_are_read_where_the_format_is_named(root):
     assert len(BlenderReader(str(root)).read().view_names) == sum(COUNTS.values())
 
 
-def test_poses_of_other_conventions_are_read(root):
-    plain = BlenderReader(str(root)).read().cameras.c2w
-    for split, count in COUNTS.items():
-        others = [np.linalg.inv(pose(view) @ np.diag([1, -1, -1, 1])).tolist() for view in range(count)]
-        write_transforms(
-            root, split, [{"file_path": f"{split}/r_{n}", "transform_matrix": other} for n, other in enumerate(others)]
-        )
-    read = BlenderReader(str(root), axes="opencv", poses="w2c").read().cameras.c2w
-    assert torch.allclose(read, plain, atol=1e-5)
-
-
 def test_masks_count_and_a_size_that_is_no_multiple_is_cropped(root):
     for path in root.rglob("r_*.png"):
         mask = root / "masks" / path.relative_to(root)
@@ -155,23 +147,80 @@ def test_file_path_may_have_its_ending_and_a_dot_is_none(root, ending):
     assert BlenderReader(str(root)).read().pixels.view(0)[..., 3].min() == 255
 
 
-@pytest.mark.data
-def test_reads_the_lego_of_200_pixels():
-    scene = BlenderReader(str(real_capture("lego_200"))).read()
-    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 100, "val": 20, "test": 25}
-    assert scene.cameras.focal[0, 0].item() == pytest.approx(277.7778, abs=1e-3)
-    assert scene.cameras.c2w[:, :, 3].norm(dim=-1).tolist() == pytest.approx([4.0311] * 145, abs=1e-3)
-    assert len(set(scene.view_names)) == 145
-    assert re.fullmatch(r"test/r_\d+", scene.view_names[-1])
+def refused(root, message, **settings):
+    with pytest.raises(InputError, match=message):
+        BlenderReader(str(root), **settings).read()
 
 
-@pytest.mark.data
-def test_downscaling_the_lego_of_800_pixels_gives_the_one_of_200():
-    skip = {"train": 20, "test": 20}
-    small = BlenderReader(str(real_capture("lego_200")), skip=skip).read()
-    large = BlenderReader(str(real_capture("lego_800")), skip=skip, downscale=4).read()
-    assert torch.allclose(small.cameras.focal[:5], large.cameras.focal[:5])
-    ours, theirs = (scene.pixels.rgba[: 5 * 200 * 200].int() for scene in (large, small))
-    # Ties are rounded to even there and up here.
-    assert (ours[:, 3] - theirs[:, 3]).abs().max() <= 1
-    assert (ours - theirs)[theirs[:, 3] > 0].abs().max() <= 1
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"downscale": 0}, r"scene.downscale is 0, but it must be 1"),
+        ({"skip": {"test": 0}}, r"scene.skip.test is 0, but it must be 1"),
+        ({"skip": {"tset": 2}}, r"scene.skip names the split 'tset'; the splits are train, val, test"),
+        ({"near": 6.0}, r"scene.near=6.0 and scene.far=6.0: rays need 0 <= near < far"),
+        ({"near": -1.0}, r"rays need 0 <= near < far"),
+        ({"far": float("nan")}, r"rays need 0 <= near < far"),
+        ({"background": "pink"}, r"background is 'pink'; choose one of white, black, random, white_or_random"),
+        ({"aabb_half": 0.0}, r"scene.aabb_half=0.0"),
+        ({"space": "ndc"}, r"scene.space=ndc has coordinates of its own. Use scene.coordinates=fitted"),
+        (
+            {"aabb_half": None},
+            r"scene.coordinates=given needs .*train.json does not give them. Set scene.near, .*aabb_half",
+        ),
+    ],
+)
+def test_refuses_settings(root, settings, message):
+    refused(root, message, **settings)
+
+
+def test_names_what_a_wrong_folder_holds(tmp_path):
+    refused(tmp_path / "none", r"The folder .*none does not exist. Set scene.root")
+    refused(tmp_path, r"transforms_train.json does not exist; the folder holds nothing. Put the file")
+    (tmp_path / "transforms.json").touch()
+    refused(tmp_path, r"the folder holds transforms.json. Put the file")
+
+
+@pytest.mark.parametrize(
+    ("content", "message", "remaining"),
+    [
+        ([], r"transforms_val.json must be a json object with the keys .*, but it is list", None),
+        ({}, r"lacks frames; it has nothing. The Blender format needs", None),
+        ({"camera_angle_x": 1, "frames": [7]}, r"frames\[0\] must be a json object", 12),
+        ({"frames": [FRAME]}, r"frames\[0\] \(train/r_0\) has no focal length: neither fl_x", 12),
+        ({"camera_angle_x": 1, "frames": [FRAME | FISHEYE]}, r"has another kind of lens \(fisheye\) than most", 11),
+    ],
+)
+def test_a_file_of_another_shape_is_refused_and_a_view_that_cannot_be_used_left_out(
+    root, caplog, content, message, remaining
+):
+    (root / "transforms_val.json").write_text(json.dumps(content))
+    if remaining is None:
+        refused(root, message)
+    else:
+        assert len(BlenderReader(str(root)).read().view_names) == remaining
+        assert re.search(message, caplog.text)
+        assert caplog.text.count("views are left out: ") == 1
+
+
+def test_refuses_too_few_views(tmp_path, root):
+    refused(write_blender(tmp_path / "one", {"train": 1}), "leaves 0 for training and 1 for evaluation")
+    (root / "transforms_train.json").write_text('{"camera_angle_x": 1, "frames": []}')
+    refused(root, "transforms_train.json lists no training view that exists")
+
+
+def test_images_that_are_absent_are_left_out_and_named_once(tmp_path, caplog):
+    root = write_blender(tmp_path, {"train": 14})
+    for view in range(1, 5):
+        (root / "train" / f"r_{view}.png").unlink()
+    assert len(BlenderReader(str(root)).read().view_names) == 10
+    assert "4 of 14 views are left out: train/r_1, train/r_2, train/r_3 and 1 more. The first:" in caplog.text
+    for view in range(5, 14):
+        (root / "train" / f"r_{view}.png").unlink()
+    refused(root, r"r_1 does not exist,.* 13 of the 14 views of \S+ cannot be used .* and 3 must remain")
+
+
+def test_images_of_another_size_are_left_out(root, caplog):
+    Image.fromarray(picture(0, 6, 4)).save(root / "val" / "r_1.png")
+    assert len(BlenderReader(str(root)).read().view_names) == 13
+    assert re.search(r"must all have one size. Most are 8 x 8, but \S+val/r_1.png is 6 x 4. Render", caplog.text)

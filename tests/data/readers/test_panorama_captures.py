@@ -1,7 +1,6 @@
 """Panoramas as nerfstudio writes them: read, examined, exported and read again."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +19,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.world_frame import directions_to_user, points_to_user
 from nerf_lightning.video.paths.photograph_path import PhotographPath
-from nerf_lightning.video.settings import FilmSettings
-from nerf_lightning.video.shots import Subject, lay_path, make_shots
+from nerf_lightning.video.shots import lay_path
 
 
 def read(root, **settings):
@@ -66,12 +64,6 @@ def test_focal_lengths_may_be_left_out_and_pictures_may_be_shrunk(root, scene, t
     torch.testing.assert_close(read(root, downscale=2).cameras.focal, 0.5 * scene.cameras.focal)
 
 
-def test_the_working_frame_is_among_the_cameras_whichever_way_they_are_turned(scene):
-    centers = scene.cameras.c2w[:, :, 3]
-    torch.testing.assert_close(centers.mean(dim=0), torch.zeros(3), atol=1e-5, rtol=0)
-    assert float(centers.norm(dim=-1).max()) == pytest.approx(1.0, abs=1e-5)
-
-
 def test_the_doctor_examines_them_and_finds_nothing_wrong(scene):
     _, checks = examine(scene)
     assert not [check for check in checks if check.verdict == "wrong"]
@@ -99,19 +91,6 @@ def test_cameras_that_were_exported_give_the_same_rays(scene, tmp_path, caplog):
     for kind in (read, lambda root: ColmapReader(str(root), cache_dir=str(root / "cache")).read()):
         back = kind(tmp_path)
         assert_same_rays(*(in_user_frame(each, rays_of(each)(all_pixels(each.cameras, 2))) for each in (scene, back)))
-
-
-def test_panoramas_that_were_rendered_and_read_again_have_the_rays_they_were_rendered_with(scene, tmp_path):
-    subject = Subject(tiny_model(), scene_record(scene), "black")
-    (shot,) = make_shots([subject], PhotographPath(3, width=48), 4096, FilmSettings(projection="equirectangular"))
-    assert (int(shot.cameras.width[0]), int(shot.cameras.height[0])) == (48, 24)
-    record = replace(scene_record(scene), cameras=shot.cameras, view_names=("0.png", "1.png", "2.png"), splits={})
-    CamerasExport().export(tiny_model(), record, tmp_path, 4096)
-    for name in record.view_names:
-        Image.new("RGB", (48, 24)).save(tmp_path / name)
-    back = read(tmp_path)
-    shown = in_user_frame(scene, shot.rays(all_pixels(shot.cameras, 1)))
-    assert_same_rays(shown, in_user_frame(back, rays_of(back)(all_pixels(back.cameras, 1))))
 
 
 def test_films_of_them_show_what_a_person_would_look_at_and_checkpoints_keep_them(scene):

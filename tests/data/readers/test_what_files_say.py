@@ -1,14 +1,12 @@
 """What the files of a capture say beside poses and pictures: it is used, or named, and nothing is dropped silently."""
 
 import io
-import json
 import re
 import shutil
 
 import numpy as np
 import pytest
 from PIL import Image, ImageCms, TiffImagePlugin
-from support import captures
 from support.malformed import edit_frame, edit_json
 from support.other_formats import write_ply
 from support.plain_capture import (
@@ -25,7 +23,6 @@ from support.posed_captures import photograph, write_colmap, write_transforms
 
 from nerf_lightning.data.pixels.masks import read_mask
 from nerf_lightning.data.pixels.picture_files import read_rgba
-from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.files.signatures import other_format
 from nerf_lightning.messages.errors import InputError
 
@@ -103,18 +100,6 @@ def test_a_rational_lens_is_never_read_as_another_one(root, caplog, frames, rema
     else:
         with pytest.raises(InputError, match=r"k[456].* divide the distortion"):
             read(root)
-
-
-def test_a_fisheye_among_renderings_is_left_out_as_among_photographs(tmp_path, caplog):
-    """The Blender format has a reader of its own."""
-    root = captures.write_blender(tmp_path / "c", {"train": 9, "val": 2, "test": 2})
-    path = root / "transforms_train.json"
-    content = json.loads(path.read_text())
-    content["frames"][2] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}
-    path.write_text(json.dumps(content))
-    scene = BlenderReader(str(root)).read()
-    assert [len(scene.splits[split]) for split in ("train", "val", "test")] == [8, 2, 2]
-    said_once(caplog, r"1 of 13 views are left out: .* has another kind of lens \(fisheye\) than most views")
 
 
 SIXTEEN = np.full((12, 16), 4000, np.uint16)

@@ -2,7 +2,6 @@ import math
 
 import pytest
 import torch
-from torch.autograd import gradcheck
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
@@ -28,10 +27,6 @@ def test_with_pi_the_lowest_frequency_has_period_two():
     without = FrequencyEncoder(3, include_input=False).double()
     torch.testing.assert_close(without(points + 2 * math.pi), without(points), **close)
     torch.testing.assert_close(encoder(points), without(math.pi * points), **close)
-
-
-def test_gradcheck():
-    assert gradcheck(FrequencyEncoder(3).double(), (torch.rand(2, 3, dtype=torch.float64, requires_grad=True),))
 
 
 def sphere(rows=64):

@@ -3,12 +3,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels
 from nerf_lightning.nerf.geometry.lens_checks import lens_faults
-from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
+from nerf_lightning.nerf.geometry.lenses import off_axis, project_plane, stretches, unproject
 from nerf_lightning.nerf.geometry.poses import look_at
 
 FOX = [0.0578421, -0.0805099, 0.0, 0.0, -0.000980296, 0.00015575]
@@ -64,26 +62,6 @@ def test_pixels_of_the_whole_image_come_back_from_their_rays(name, dtype, tolera
     torch.testing.assert_close(norms, torch.ones_like(norms))
 
 
-def test_without_coefficients_the_radial_model_is_the_pinhole():
-    cameras = lens_camera("fox")
-    none = replace(cameras, lens=torch.zeros_like(cameras.lens))
-    pinhole = replace(none, lens_model="pinhole")
-    assert torch.equal(rays_of(none).directions, rays_of(pinhole).directions)
-    points = torch.randn(50, 3, dtype=torch.float64)
-    torch.testing.assert_close(project(none, 0, points), project(pinhole, 0, points), rtol=0, atol=1e-9)
-
-
-def test_the_pinhole_is_what_it_was_to_the_bit():
-    cameras = replace(lens_camera("fox", torch.float32), lens_model="pinhole")
-    index = pixels_of(cameras)
-    x = (index.x + 0.5 - cameras.center[0, 0]) / cameras.focal[0, 0]
-    y = (index.y + 0.5 - cameras.center[0, 1]) / cameras.focal[0, 1]
-    world = (cameras.c2w[0, :, :3] @ torch.stack([x, -y, -torch.ones_like(x)], dim=-1)[..., None])[..., 0]
-    assert torch.equal(rays_of(cameras).directions, world / world.norm(dim=-1, keepdim=True))
-    plane = places()
-    assert unproject(plane, torch.zeros(6).double(), "pinhole").tolist() == [[u, v, 1.0] for u, v in plane.tolist()]
-
-
 def test_an_equidistant_fisheye_measures_angles():
     none = torch.zeros(6, dtype=torch.float64)
     angle = torch.tensor([0.0, 0.3, math.pi / 2, 2.0], dtype=torch.float64)
@@ -126,15 +104,6 @@ def test_against_bisection_on_the_radius(model, lens):
         radius = math.tan(off_axis(direction)[0]) if model == "radial_tangential" else float(off_axis(direction)[0])
         assert radius == pytest.approx(found, abs=1e-9)
         assert math.atan2(direction[1], direction[0]) == pytest.approx(math.atan2(v, u), abs=1e-9)
-
-
-@pytest.mark.parametrize(("model", "lens"), [("radial_tangential", STRONG), ("fisheye", GOPRO)])
-def test_turning_the_image_turns_the_rays(model, lens):
-    lens, c, s = torch.tensor(lens).double(), math.cos(0.7), math.sin(0.7)
-    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
-    plane = places()
-    turned = unproject(plane @ turn[:2, :2].T, lens, model)
-    torch.testing.assert_close(turned, unproject(plane, lens, model) @ turn.T)
 
 
 def test_each_view_has_its_own_lens():
@@ -191,25 +160,6 @@ def test_nothing_depends_on_values(model):
     """On the meta device there are none: a branch or a size that asks for one fails, as it would wait on a GPU."""
     plane, lens = torch.empty(5, 2, device="meta"), torch.empty(5, 6, device="meta")
     assert project_plane(unproject(plane, lens, model), lens, model).shape == (5, 2)
-
-
-def test_angles_and_headings_are_inverted():
-    directions = torch.nn.functional.normalize(torch.randn(100, 3, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(at_angle(*off_axis(directions)), directions)
-
-
-mild = st.floats(-0.08, 0.08)
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.tuples(mild, mild, mild, mild), st.tuples(*[st.floats(-0.005, 0.005)] * 2), st.booleans())
-def test_mild_lenses_are_inverted(k, p, fisheye):
-    model = "fisheye" if fisheye else "radial_tangential"
-    lens = torch.tensor([*k, *((0.0, 0.0) if fisheye else p)], dtype=torch.float64)
-    plane = places(50, most=0.5)
-    directions = unproject(plane, lens, model)
-    torch.testing.assert_close(project_plane(directions, lens, model), plane, rtol=0, atol=1e-9)
-    assert bool((stretches(directions, lens, model)[..., 0] > 0.5).all())
 
 
 NONE = [0.0] * 6

@@ -67,16 +67,6 @@ def test_rays_know_where_the_camera_looked_in_the_world():
     assert not torch.allclose(found.directions, rays.directions, atol=0.05)
 
 
-def test_two_rays_through_one_world_point_meet_in_the_cube():
-    point = torch.tensor([0.7, -0.4, -3.5], dtype=torch.float64)
-    eyes = torch.tensor([[0.3, 0.1, 0.2], [-0.5, 0.4, -0.3]], dtype=torch.float64)
-    rays = ndc_rays(bundle(eyes, point - eyes), SCALE)
-    meeting = ndc_points(point, SCALE)
-    for origin, direction in zip(rays.origins, rays.directions, strict=True):
-        off = torch.linalg.cross(meeting - origin, direction)
-        assert float(off.norm()) < 1e-12
-
-
 @pytest.mark.parametrize("distance", [2.5, 6.0, 40.0])
 def test_world_distance_is_the_way_back(distance):
     rays = forward_rays()

@@ -1,13 +1,11 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from support.panoramas import Panorama, near_the_bricks, traced
+from support.panoramas import near_the_bricks
 from support.scenes import LENSES
 
-from nerf_lightning.data.bricks.tracer import Pinhole
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels
 from nerf_lightning.nerf.geometry.footprints import footprint
 from nerf_lightning.nerf.geometry.lens_checks import lens_faults
@@ -81,49 +79,6 @@ def test_discs_hold_the_small_spheres_that_they_stand_for():
     assert bool((reach[centers.norm(dim=-1) < 2 * radius] == 0).all())
 
 
-FACES = torch.tensor(
-    [
-        [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-        [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]],
-        [[0.0, 0, -1], [0, 1, 0], [1, 0, 0]],
-        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]],
-    ],
-    dtype=torch.float64,
-)
-"""Rotations of six cameras that look ahead, to both sides, back, up and down."""
-
-
-def test_a_panorama_of_the_bricks_agrees_with_the_six_faces_of_a_cube():
-    """Through our cameras the one is looked up in the others; each was traced by formulas of its own."""
-    size, face = 96, 128
-    pose = near_the_bricks(1)
-    picture = traced([Panorama(pose[0].numpy(), 1.0, size)])[0]
-    centers = pose[:, :, 3:].expand(6, 3, 1)
-    cube = torch.cat([pose[:, :, :3] @ FACES, centers], dim=-1)
-    faces = torch.from_numpy(traced([Pinhole(each.numpy(), 0.5 * face, face) for each in cube]))
-    points = all_rays(panorama_cameras(pose, size, size)).directions + pose[0, :, 3]
-    cameras = pinhole_cameras(cube, 0.5 * face, face, face)
-    found, holders = torch.zeros(size, size, 3, dtype=torch.float64), torch.zeros(size, size)
-    for number in range(6):
-        ahead = (points - cube[number, :, 3]) @ cube[number, :, 2] < 0
-        place = project(cameras, number, points)
-        within = ahead & ((place >= 0) & (place <= face)).all(dim=-1)
-        grid = (2 * place / face - 1)[None]
-        looked_up = torch.nn.functional.grid_sample(
-            faces[number].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border"
-        )[0].permute(1, 2, 0)
-        found[within] = looked_up[within]
-        holders += within
-    assert bool((holders >= 1).all())
-    assert float((torch.from_numpy(picture) < 0.99).double().mean()) > 0.02  # there is something to see
-    error = (torch.from_numpy(picture) - found).square().mean()
-    shifted = (torch.from_numpy(np.roll(picture, 2, axis=1)) - found).square().mean()
-    assert -10 * math.log10(float(error)) > 30.0
-    assert float(error) < 0.3 * float(shifted)  # two pixels off would be seen
-
-
 @pytest.mark.parametrize(("model", "lens"), LENSES)
 def test_a_footprint_holds_whatever_the_sphere_touches(model, lens):
     """Every pixel whose ray meets the sphere lies in its disc, also at the rim and for spheres half outside."""
@@ -167,12 +122,3 @@ def test_a_sphere_beyond_the_rim_is_seen_where_it_reaches_into_the_image():
     assert float(x) == pytest.approx(79.5, abs=1e-3)
     assert float(y) == pytest.approx(79.5, abs=1e-3)
     assert float(radius) > 1.0
-
-
-def test_without_coefficients_a_footprint_is_nearly_the_pinholes():
-    cameras = pinhole_cameras(torch.eye(4)[None, :3], 20.0, 40, 40)
-    centers = torch.tensor([[0.0, 0.0, -3.0], [1.0, -0.5, -4.0], [-1.5, 1.2, -2.0]])
-    x, y, radius = footprint(cameras, 0, centers, 0.1)
-    bent_x, bent_y, bent_radius = footprint(replace(cameras, lens_model="radial_tangential"), 0, centers, 0.1)
-    torch.testing.assert_close(torch.stack([bent_x, bent_y]), torch.stack([x, y]))
-    torch.testing.assert_close(bent_radius, radius, rtol=0.3, atol=0)

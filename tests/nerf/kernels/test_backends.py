@@ -191,19 +191,6 @@ def test_a_flipped_bit_in_a_cached_kernel_changes_no_result(tmp_path):
     assert returned(tmp_path, number, number) == [f"{number} 0", f"{number} 1"]
 
 
-@pytest.mark.parametrize(
-    ("kernel", "other"),
-    [
-        ("mlp.cpu", "vectors.py"),
-        ("march.cpu", "grid.py"),
-        ("hash_grid.cpu", "reference.py"),
-        ("render.cpu", "activations.py"),
-    ],
-)
-def test_those_that_are_known_to_take_something_are_found(kernel, other):
-    assert other in {Path(file).name for file in backends._sources(f"nerf_lightning.nerf.kernels.{kernel}")}
-
-
 def test_the_mathematics_holds_no_conditions_for_kernels():
     """The kernels themselves, or the front of each (`op.py`), know for what there is one."""
     package = Path(backends.__file__).parents[2]

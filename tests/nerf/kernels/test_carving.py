@@ -8,9 +8,7 @@ import torch
 from support.scenes import BALL_RADIUS, LENSES, ball_scene
 from support.wrong_cameras import with_noise
 
-from nerf_lightning.nerf.geometry.footprints import footprint
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
-from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.carving import cpu as carving_cpu
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
@@ -60,13 +58,6 @@ def a_view():
     return cameras, 1, 2.0 * torch.randn(60_000, 3, generator=generator), generator
 
 
-def test_the_compiled_footprints_have_the_references_bits(a_view):
-    cameras, view, centers, _ = a_view
-    camera, _, _ = carving_cpu._camera(cameras, view)
-    found = [carving_cpu._footprint(*center, camera, *carving_cpu._halves(0.07)) for center in centers[:500].numpy()]
-    assert torch.equal(torch.tensor(found), torch.stack(footprint(cameras, view, centers[:500], 0.07), dim=-1))
-
-
 @pytest.mark.parametrize("half_diagonal", [0.01, 0.07, 0.5])
 def test_the_compiled_twin_sees_and_carves_what_the_reference_does(a_view, half_diagonal):
     cameras, view, centers, generator = a_view
@@ -84,28 +75,6 @@ def test_the_compiled_twin_sees_and_carves_what_the_reference_does(a_view, half_
     # The widest discs leave no pixel of these free of matter that is sure to be it.
     assert torch.equal(carved[1], drawn < 0.9) == (half_diagonal == 0.5)
     assert torch.equal(*carved)
-
-
-def test_matter_is_widened_to_squares_that_hold_the_largest_disc():
-    matter = torch.zeros(20, 30, dtype=torch.bool)
-    matter[3, 12] = matter[19, 0] = True
-    found = carving_reference.widened(matter, torch.tensor([0.0, 0.4, 2.3]))  # 2.3 and half a pixel: 3
-    expected = torch.zeros_like(matter)
-    expected[0:7, 9:16] = expected[16:20, 0:4] = True
-    assert found is not None
-    assert torch.equal(found, expected)
-
-
-def test_without_a_disc_that_fits_nothing_is_widened():
-    for radius in ([], [0.0], [9.8]):
-        assert carving_reference.widened(torch.ones(20, 30, dtype=torch.bool), torch.tensor(radius)) is None
-
-
-def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
-    scene = ball_scene(num_views=24, size=40)
-    fast = possible_cells(scene, *cells(scene))
-    with without("carving.cpu"):
-        assert torch.equal(possible_cells(scene, *cells(scene)), fast)
 
 
 def test_cameras_that_are_learnt_carve_with_a_margin():

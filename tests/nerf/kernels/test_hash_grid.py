@@ -76,17 +76,12 @@ def test_a_hashed_level_shares_its_entries_and_gradients_are_added_in_place_wher
     torch.testing.assert_close(kept.grad, expected + 1.0)
 
 
-def test_the_result_does_not_depend_on_the_threads(monkeypatch):
+def test_the_result_does_not_depend_on_the_threads(set_threads):
     layout = LAYOUTS[2]
-    given = inputs(layout, 4)
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            results.append(values_and_gradients(interpolate, *given, layout))
-    finally:
-        torch.set_num_threads(before)
+    given, results = inputs(layout, 4), []
+    for threads in (1, 2):
+        set_threads(threads)
+        results.append(values_and_gradients(interpolate, *given, layout))
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 

@@ -79,19 +79,6 @@ def _of_rays(samples, chosen):
     return chosen[samples.ray_index].nonzero()[:, 0], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
-def test_marching_in_rounds_finds_what_one_march_finds():
-    rays, state, lattice, grid = a_march(share=0.3)
-    whole, _ = march(rays, state, lattice, grid)
-    found = []
-    while bool((state.next < lattice.numel() - 2).any()):
-        part, following = march(rays, state, lattice, grid, limit=3)
-        state.next.copy_(following)
-        found.append(torch.stack([part.ray_index.double(), part.starts.double()], dim=-1))
-    everything = torch.cat(found)
-    order = (everything[:, 0] * 1e3 + everything[:, 1]).argsort()
-    torch.testing.assert_close(everything[order, 1].float(), whole.starts)
-
-
 def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
     rays, state, lattice, grid = a_march(count=50, share=2.0)
     samples, _ = march(rays, state, lattice, grid)
@@ -99,16 +86,3 @@ def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
     chord = (state.leave - state.enter).clamp(min=0)
     assert float((lengths - chord).abs().max()) <= 0.021  # an interval at either end, half of it each
     assert bool((samples.deltas > 0).all())
-
-
-def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():
-    rays, state, lattice, grid = a_march(count=40, share=0.5)
-    whole, _ = march(rays, state, lattice, grid)
-    total = int(whole.bounds[-1])
-    for capacity in (total + 100, total // 2):
-        samples, _ = march(rays, state, lattice, grid, capacity=capacity)
-        kept = min(capacity, total)
-        assert samples.starts.shape == (capacity,)
-        assert int(samples.bounds[-1]) == kept
-        torch.testing.assert_close(samples.starts[:kept], whole.starts[:kept])
-        assert bool((samples.deltas[kept:] == 0).all())

@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 import torch
 from support.comparing import far_apart
+from support.ragged_levels import needs_bfloat16
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.mlp import amx
 from nerf_lightning.nerf.kernels.mlp.op import mlp, mlp_torch
-from nerf_lightning.nerf.matmul_precision import TILE_ROWS, cpu_multiplies_bfloat16
-from nerf_lightning.nerf.matmul_precision import TILE_ROWS as TILE
+from nerf_lightning.nerf.matmul_precision import TILE_ROWS
 
-needs_bfloat16 = pytest.mark.skipif(
-    not cpu_multiplies_bfloat16(), reason="this CPU, as far as torch may use it, does not multiply bfloat16 itself"
-)
 SIZES = [(32, 64, 16), (32, 64, 64, 3), (16, 16, 5), (48, 80, 128, 7), (16, 1)]
-ROWS = [0, 1, 2, 127, 128, 129, TILE_ROWS + 17]
+ROWS = [0, 1, 127, 129, TILE_ROWS + 17]
 
 
 @pytest.fixture
@@ -94,17 +91,14 @@ def test_gradients_of_weights_do_not_see_what_memory_held_before(kernels, dtype)
     assert torch.equal(results[0], results[2])
 
 
-def test_the_result_does_not_depend_on_the_threads(dtype):
+def test_the_result_does_not_depend_on_the_threads(dtype, set_threads):
     points, weights = given((32, 64, 3), 3 * TILE_ROWS, dtype)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            leaves = [weight.float().clone().requires_grad_() for weight in weights]
-            mlp(points, leaves, "bfloat16" if dtype == torch.bfloat16 else "float32").square().sum().backward()
-            results.append(torch.cat([leaf.grad.flatten() for leaf in leaves]))
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for threads in (1, 2):
+        set_threads(threads)
+        leaves = [weight.float().clone().requires_grad_() for weight in weights]
+        mlp(points, leaves, "bfloat16" if dtype == torch.bfloat16 else "float32").square().sum().backward()
+        results.append(torch.cat([leaf.grad.flatten() for leaf in leaves]))
     assert torch.equal(*results)
 
 
@@ -161,7 +155,7 @@ def weights(*sizes):
     return [torch.randn(b, a) / a**0.5 for a, b in pairwise(sizes)]
 
 
-@pytest.mark.parametrize("rows", [0, 1, TILE, 2 * TILE + 17])
+@pytest.mark.parametrize("rows", [0, 1, TILE_ROWS, 2 * TILE_ROWS + 17])
 @pytest.mark.parametrize("sizes", [(32, 64, 16), (32, 64, 64, 3), (5, 2)])
 def test_tiles_equal_the_reference_in_value_and_gradient(rows, sizes):
     # In float64: in float32 a unit within rounding of zero is on in one and off in the other.
@@ -176,7 +170,7 @@ def test_tiles_equal_the_reference_in_value_and_gradient(rows, sizes):
         assert float((found - expected).norm()) <= 1e-12 * float(expected.norm())
 
 
-@pytest.mark.parametrize("rows", [100, TILE + 700])
+@pytest.mark.parametrize("rows", [100, TILE_ROWS + 700])
 def test_it_multiplies_bfloat16_where_it_is_told_to_and_adds_up_gradients_in_float32(rows):
     points, used = torch.randn(rows, 32), weights(32, 64, 3)
     exact = mlp(points, used)

@@ -163,18 +163,15 @@ def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_many_rays_are_shared_out_and_nothing_changes(threads):
+def test_many_rays_are_shared_out_and_nothing_changes(threads, set_threads):
     level, rays = a_level(density_bias=3.0), some_rays(600)
     level.returns_weights = False
-    weight, before = torch.randn(600, 8), torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
-        seen, gradients = learnt(level, rays, None, weight)
-        again, of_again = learnt(level, rays, None, weight)
-        torch.set_num_threads(1)
-        alone, of_alone = learnt(level, rays, None, weight)
-    finally:
-        torch.set_num_threads(before)
+    weight = torch.randn(600, 8)
+    set_threads(threads)
+    seen, gradients = learnt(level, rays, None, weight)
+    again, of_again = learnt(level, rays, None, weight)
+    set_threads(1)
+    alone, of_alone = learnt(level, rays, None, weight)
     assert torch.equal(seen, again)
     assert torch.equal(seen, alone)
     for name, gradient in gradients.items():

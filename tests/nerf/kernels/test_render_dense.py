@@ -171,15 +171,12 @@ def test_what_is_not_a_number_is_not_hidden():
 
 
 @pytest.mark.parametrize("kind", [DenseLevel, ProposalLevel])
-def test_threads_share_rays_out_and_each_number_of_them_has_its_bits(kind):
+def test_threads_share_rays_out_and_each_number_of_them_has_its_bits(kind, set_threads):
     level, rays, grads = a_level(kind, contraction=True), some_rays(600), torch.randn(600, 15)
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 2):
-            torch.set_num_threads(threads)
-            found.append(learnt(level, rays, None, grads, torch.zeros(600, 3)))
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 2, 2):
+        set_threads(threads)
+        found.append(learnt(level, rays, None, grads, torch.zeros(600, 3)))
     (one, of_one), (two, of_two), (again, of_again) = found
     assert torch.equal(one, two)
     assert torch.equal(two, again)
@@ -215,17 +212,6 @@ def test_fields_that_the_kernel_does_not_know_take_the_plain_way():
     assert not hooked.takes_whole_rays(cpu, training=True)
     other = a_level(type("Other", (DenseLevel,), {"field_output": lambda self, points: self.field(points)}))
     assert not other.takes_whole_rays(cpu, training=True, learns_cameras=False)
-
-
-def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
-    level, rays = a_level(ProposalLevel), some_rays(30)
-    level.learn_every, level.learn_always = 4, 0
-    monkeypatch.setattr(workspace, "_spare", [])
-    level.on_step(StepContext(0.0, 1, 0))
-    assert not level(rays, None, [], batch_random(0, 30)).weights.requires_grad
-    assert not workspace._spare
-    level.on_step(StepContext(0.0, 4, 0))
-    assert level(rays, None, [], batch_random(0, 30)).weights.requires_grad
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])

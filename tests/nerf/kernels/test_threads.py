@@ -11,11 +11,8 @@ from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, over_r
 
 
 @pytest.fixture(autouse=True)
-def two_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+def two_threads(set_threads):
+    set_threads(2)
 
 
 def threads_of_parts(_=None):
@@ -54,28 +51,6 @@ def test_torch_may_have_one_thread_while_work_is_shared_out():
             assert num_threads() == 2
         assert (torch.get_num_threads(), num_threads()) == (1, 2)
     assert (torch.get_num_threads(), num_threads()) == (2, 2)
-
-
-def test_the_calling_thread_takes_parts_as_well():
-    both = threading.Barrier(2, timeout=10)  # each of two parts waits for the other
-
-    def meet(part):
-        both.wait()
-        return threading.get_ident()
-
-    assert threading.get_ident() in in_parallel(meet, range(2))
-
-
-def test_after_a_failure_no_further_part_is_taken():
-    taken = []
-
-    def fail(part):
-        taken.append(part)
-        raise ValueError(part)
-
-    with pytest.raises(ValueError, match=r"0|1"):
-        in_parallel(fail, range(100))
-    assert len(taken) <= 2
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])

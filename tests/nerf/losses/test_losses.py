@@ -68,14 +68,6 @@ def test_only_known_distances_count_and_those_by_their_certainty():
     assert loss([rendering, rendering], nothing)["depth"].tolist() == [0.0, 0.0]
 
 
-def test_gradients_raise_the_density_at_the_surface_and_lower_it_before():
-    density = torch.full((1, SAMPLES), 2.0, requires_grad=True)
-    DepthLoss()([seen(density)], target_of([4.0]))["depth"].sum().backward()
-    surface = SAMPLES // 2
-    assert float(density.grad[0, surface]) < 0
-    assert float(density.grad[0, : SAMPLES // 4].min()) > 0
-
-
 def test_ragged_samples_cost_the_same():
     torch.manual_seed(0)
     density, known = torch.rand(5, 7), torch.tensor([2.0, 3.0, 4.0, 5.0, 9.0])

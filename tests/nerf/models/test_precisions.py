@@ -26,7 +26,7 @@ LESS["view_transformer"] = (5, 8, 12)
 # They render each view from up to ten others.
 LOOKING = ("view_transformer", "view_transformer_tiny")
 # One of each kind; make test-slow has the others, which are larger.
-ALWAYS = ("nerf_tiny", "nerf_occupancy", "fast_small", "fast_dense", "fast_proposal", "view_transformer_tiny")
+ALWAYS = ("nerf_tiny", "fast_small", "fast_proposal", "view_transformer_tiny")
 # Two of four: from both sides.
 SEEN_FROM = (0, 2)
 

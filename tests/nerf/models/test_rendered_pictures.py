@@ -66,34 +66,6 @@ def test_depth_in_normalised_device_coordinates_is_distance_in_the_world(depth):
     assert bool((picture.opacity > 0.999).all())
 
 
-def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stays():
-    bent = replace(pinhole_cameras(torch.eye(4)[:3][None], 10.0, 12, 9), ndc=torch.tensor([[10 / 6, 10 / 4.5]]))
-    model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(1 - 2 / 3.0))})
-    near, far = torch.zeros(1), torch.ones(1)
-    for box, seen in (((-2.5, -3.5), 1.0), ((-1.5, -2.5), 0.0)):
-        clip = Clip(box=CropBox.from_user((-9.0, -9.0, box[1]), (9.0, 9.0, box[0]), torch.eye(4)))
-        picture = render_picture(model, RayGenerator(bent, near, far), 0, "black", 100_000, clip)
-        assert picture.opacity.min() == pytest.approx(seen, abs=1e-3)
-        assert picture.opacity.max() == pytest.approx(seen, abs=1e-3)
-        if seen:
-            assert float(picture.depth[4, 6]) == pytest.approx(3.0, rel=0.02)
-
-
-def test_depth_is_the_distance_along_the_ray_and_where_nothing_is_far_and_finite():
-    bent = replace(pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4), ndc=torch.tensor([[5.0, 5.0]]))
-    model = RadianceModel({"only": DenseLevel(StratifiedSampler(8), Wall(2.0))})
-    picture = render_picture(model, RayGenerator(bent, torch.zeros(1), torch.ones(1)), 0, "black", tile_points=1000)
-    assert bool((torch.isfinite(picture.depth) & (picture.depth > 100)).all())
-    assert float(picture.opacity.max()) == 0.0
-    cameras = pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4)
-    model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(-3.0, behind=-1.0))})
-    picture = render_picture(
-        model, RayGenerator(cameras, torch.full((1,), 1.0), torch.full((1,), 6.0)), 0, "black", 100_000
-    )
-    rays = rays_through_pixels(cameras, all_pixels(cameras, 0), torch.zeros(1), torch.ones(1))
-    torch.testing.assert_close(picture.depth, 3.0 / -rays.directions[..., 2], rtol=0.01, atol=0)
-
-
 class Ball(Wall):
     """Opaque inside a ball of this radius around (0, 0, -4); its color is where it is looked at from."""
 

@@ -10,7 +10,6 @@ from support.static_models import MODELS, fast_model, static_system
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.part import StepContext, begin_step
 from nerf_lightning.nerf.types.progress import Progress
@@ -60,30 +59,6 @@ def test_the_grid_is_updated_without_reading_a_number():
     plain, _, update, same_cells = operations_of_steps("fast_dense", [5, 8, 16, 24])
     assert len(update) > len(plain)
     assert update == same_cells
-
-
-class Planted(MeanSquaredError):
-    def __init__(self, fault):
-        super().__init__()
-        self.fault = fault
-
-    def forward(self, renderings, target):
-        self.fault(renderings[-1].opacity)
-        return super().forward(renderings, target)
-
-
-FAULTS = {
-    "a number that is read": lambda opacity: opacity.mean().item(),
-    "a branch that depends on data": lambda opacity: bool(opacity.mean() > 0.5),
-    "a boolean mask": lambda opacity: opacity[opacity > 0.5].sum(),
-    "nonzero": lambda opacity: opacity.nonzero(),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_xla_could_not_compile_is_refused(fault):
-    with pytest.raises((RuntimeError, NotImplementedError), match=r"[Mm]eta"):
-        operations_of_steps("nerf", [1], loss=Planted(FAULTS[fault]))
 
 
 def test_the_packed_form_is_refused():
