@@ -1,4 +1,4 @@
-"""What else may befall a command: killed in any phase, its folder deleted or renamed, stopped, started twice.
+"""What may befall a command: killed at any moment, no room on its disk, its folder renamed.
 
 It ends well, or with one paragraph; the same command again has the result of one that nothing befell, and leaves
 nothing beside it.

@@ -1,11 +1,11 @@
-"""The fast path from the command line: resume, time budgets, refusals."""
+"""The fast path from the command line: resume and time budgets."""
 
 import signal
 import time
 
 import pytest
 import torch
-from support.running import FAST, FAST_PATH, finished, output_of, said, saved, start
+from support.running import FAST, FAST_PATH, finished, output_of, saved, start
 from support.systems import POSIX
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
@@ -73,18 +73,3 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     assert used[0] >= 0.75
     assert "training: 1 s (budget.seconds), " in output
     assert f"{content['global_step']} steps in " in output
-
-
-@pytest.mark.parametrize(
-    ("overrides", "parts"),
-    [
-        (("encoder.log2_table_size=30", "encoder.num_levels=16", "encoder.max_resolution=9999"), ("GiB",)),
-        (("data.sample_budget=100", "data.crop_steps=5"), ("data.sample_budget=100", "no crop")),
-        (("encoder.log2_table_size=34",), ("log2_table_size=34",)),
-        (("encoder@direction_encoder=hash_grid",), ("directions do not lie in the unit cube",)),
-    ],
-)
-def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overrides, parts):
-    folder = tmp_path / "run"
-    said(nerf("train", "scene=npz", f"scene.path={capture}", *QUIET, f"paths.output_dir={folder}", *overrides), *parts)
-    assert not folder.exists()

@@ -2,12 +2,10 @@ import logging
 
 import pytest
 import torch
-from support.scenes import tiny_model
 
 from nerf_lightning.compute import precision
 from nerf_lightning.compute.settings import CPU_TILE_POINTS, MOST_CPU_TILE_POINTS
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
@@ -84,15 +82,6 @@ def test_tiles_can_be_chosen_and_switched_off_and_measured_ones_are_kept_within_
     for found, taken in ((1, 1024), (1 << 31, 1 << 18)):
         settings.keep_tile(found)
         assert settings.tile_points == taken
-
-
-@pytest.mark.parametrize(("precision", "matmul_precision"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
-def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_precision):
-    model = TrainerSettings(accelerator="cpu", precision=precision).prepare(tiny_model())
-    layers = [module for module in model.modules() if isinstance(module, Linear)]
-    assert {layer.matmul_precision for layer in layers} == {matmul_precision}
-    assert len(layers) == 2 * 5  # three of the trunk, the feature, the color's hidden one
-    assert {parameter.dtype for parameter in model.parameters()} == {torch.float32}
 
 
 def test_what_this_machine_lacks_is_refused_with_a_cure(monkeypatch):
