@@ -23,6 +23,23 @@ def test_a_config_is_composed_without_torch():
     assert output.splitlines()[-1] == "0 []"
 
 
+# What Lightning brings along of these is Lightning's; nothing of ours may ask for them before there is work for them.
+FOR_LATER = ("matplotlib", "scipy", "numba", "llvmlite", "imageio", "sympy", "triton", "torchvision")
+
+
+@pytest.mark.exhaustive
+def test_training_imports_nothing_heavy_beside_lightnings_own():
+    code = (
+        "import sys, lightning.pytorch\n"
+        "known = set(sys.modules)\n"
+        "import nerf_lightning.commands.train\n"
+        "added = {name.partition('.')[0] for name in set(sys.modules) - known}\n"
+        f"print(sorted(added.intersection({FOR_LATER})))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "[]"
+
+
 @pytest.mark.parametrize(
     ("terminal", "arguments", "lines"),
     [(True, ["seed=1", "-m"], 1), (False, ["seed=1"], 0), (True, ["--cfg", "job"], 0)],

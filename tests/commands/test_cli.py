@@ -1,10 +1,13 @@
 import os
+import sys
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 from support.configs import yaml_files
 from support.running import said
 
+from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.hydra_versions import IS_1_3
 
@@ -22,7 +25,7 @@ def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkey
 
 def test_json_is_refused_without_a_table_and_what_readers_share_is_no_scene_and_no_command(nerf):
     said(nerf("train", "--json"), "nerf train prints no table", "doctor, table, selftest and bench")
-    assert "There is no command 'capture'" in nerf("capture").err
+    assert "There is no command 'capture_defaults'" in nerf("capture_defaults").err
     refused = nerf("train", "scene=capture").err
     assert "There is no scene=capture." in refused
     assert "colmap" in refused.partition("Its options are")[2]
@@ -36,7 +39,37 @@ def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
     assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]
 
 
-@pytest.mark.skipif(not IS_1_3, reason="Hydra 1.4 looks for the mode in the command line and the main yaml only")
+of_1_3 = pytest.mark.skipif(
+    not IS_1_3, reason="Hydra 1.4 looks for the mode in the command line and the main yaml only"
+)
+
+
+@pytest.fixture
+def compositions(monkeypatch):
+    """How often Hydra composed a config."""
+    times, load = [], ConfigLoaderImpl.load_configuration
+
+    def counted(*given, **named):
+        times.append(1)
+        return load(*given, **named)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    return times
+
+
+@of_1_3
+@pytest.mark.parametrize(("more", "times"), [((), 1), (("hydra.mode=RUN",), 2), (("--config-dir={}",), 2)])
+def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_users(
+    compositions, tmp_path, monkeypatch, capsys, more, times
+):
+    arguments = ["table", f"paths.output_dir={tmp_path}", f"runs=[{tmp_path}]", *more]
+    monkeypatch.setattr(sys, "argv", ["nerf", *(each.format(tmp_path) for each in arguments)])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert len(compositions) == times, capsys.readouterr()
+
+
+@of_1_3
 def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "many.yaml").write_text("# @package _global_\nhydra:\n  mode: MULTIRUN\n")

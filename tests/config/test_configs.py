@@ -104,6 +104,37 @@ def test_a_level_refuses_a_sampler_of_another_kind_in_words(model, level, sample
     assert "choose another sampler, or a model with another level" in str(refused.value.__cause__)
 
 
+PARTS = ("encoder", "encoder@direction_encoder", "field")
+SAMPLED = {"nerf": ("coarse", "fine"), "fast_proposal": ("proposal", "fine")}
+
+
+def builds_or_is_refused_in_words(*overrides):
+    """Build a model, or be told by one of its parts, in a sentence, what does not fit."""
+    config = composed("train", *overrides)
+    try:
+        reason = None if build(config.model).points_per_ray(training=True) > 0 else "no points"
+    except HydraException as error:
+        reason = error.__cause__
+    assert reason is None or (isinstance(reason, ValueError) and " " in str(reason)), overrides
+
+
+def choices(group):
+    return options(group.partition("@")[0])
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("model", options("model"))
+def test_every_part_of_every_model_builds_or_is_refused_in_words(model):
+    for group in PARTS:
+        for option in choices(group):
+            builds_or_is_refused_in_words(f"model={model}", f"{group}={option}")
+    for level in SAMPLED.get(model.partition("_")[0] if model not in SAMPLED else model, ("fine",)):
+        if level in composed("train", f"model={model}").model.get("levels", {}):
+            for option in options("sampler"):
+                builds_or_is_refused_in_words(f"model={model}", f"sampler@model.levels.{level}.sampler={option}")
+
+
 @pytest.mark.parametrize("option", options("scene"))
 def test_every_scene_reader_builds(option):
     keys = [key for key in loaded("scene", option) if OmegaConf.is_missing(loaded("scene", option), key)]
