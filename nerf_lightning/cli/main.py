@@ -152,9 +152,9 @@ def _run(command: str, arguments: list[str]) -> None:
             return run_job(ends_quietly()(module.run), config, command)
         # Caught inside the job as well: Hydra would print the overrides first.
         with explained(command):
-            from nerf_lightning.config.instantiate import require_sections
+            from nerf_lightning.config.instantiate import require_kinds
 
-            require_sections(config, command)
+            require_kinds(config, command)
             return module.run(config)
 
     with explained(command):

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.hydra_versions import DEFAULTS, search_extensions
-from nerf_lightning.config.instantiate import require_sections
+from nerf_lightning.config.instantiate import require_kinds
 from nerf_lightning.config.overrides import key_of
 from nerf_lightning.files.folders import conf_folder
 
@@ -80,7 +80,7 @@ def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
     """Return a command's config with Hydra's own."""
     with in_words(command), _hydra():
         config = compose(command, overrides=list(overrides), return_hydra_config=True)
-        require_sections(config, command)
+        require_kinds(config, command)
     return config
 
 

@@ -40,17 +40,21 @@ def required_path(key: str, value: object) -> str:
     return value
 
 
-def require_sections(config: DictConfig, command: str) -> None:
-    """Refuse a word or number in place of a section of settings of the command's own YAML."""
-    for key, section in _sections(conf_file(command)).items():
-        if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
+def require_kinds(config: DictConfig, command: str) -> None:
+    """Refuse values of another kind than in the command's own YAML: a word in place of a section, switch or number."""
+    for key, default in _own_settings(conf_file(command)).items():
+        if key not in config or OmegaConf.is_missing(config, key):
+            continue
+        if isinstance(default, dict) and not isinstance(config[key], DictConfig):
             raise InputError(
-                f"{key}={config[key]} is not valid: it holds settings, such as {key}.{next(iter(section))}=VALUE."
+                f"{key}={config[key]} is not valid: it holds settings, such as {key}.{next(iter(default))}=VALUE."
             )
+        if isinstance(default, bool | int | float):
+            require_fitting(config[key], bool if isinstance(default, bool) else float, key)
 
 
 @cache
-def _sections(file: Path) -> dict[str, Any]:
+def _own_settings(file: Path) -> dict[str, Any]:
     """Return the content of one of our YAMLs."""
     sections = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
     assert isinstance(sections, dict)
