@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +29,6 @@ class Panorama(Pinhole):
         return np.stack([0 * whole, whole])
 
 
-@cache
-def tracer() -> Tracer:
-    return Tracer(fire_engine())
-
-
 def near_the_bricks(count: int, distance: float = 2.2) -> torch.Tensor:
     """Poses around the model, close to it, each turned to another side."""
     angle = torch.arange(count, dtype=torch.float64) * 2.4
@@ -43,18 +37,12 @@ def near_the_bricks(count: int, distance: float = 2.2) -> torch.Tensor:
     return look_at(eyes, target, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
 
 
-def traced(views: list[Pinhole], background: float = 1.0) -> np.ndarray:
-    """Pictures over a gray, from 0 to 1."""
-    size = views[0].resolution
-    rgba = tracer().pictures(views).reshape(len(views), size, size, 4) / 255.0
-    return rgba[..., :3] * rgba[..., 3:] + background * (1.0 - rgba[..., 3:])
-
-
 def write_panoramas(root: Path, count: int = 8, size: int = 32, **changed: object) -> Path:
     """Write bricks as nerfstudio writes panoramas, twice as wide as high."""
     (root / "images").mkdir(parents=True)
     c2w = near_the_bricks(count).numpy()
-    pictures = traced([Panorama(pose, 1.0, 2 * size) for pose in c2w], background=0.5)
+    rgba = Tracer(fire_engine()).pictures([Panorama(pose, 1.0, 2 * size) for pose in c2w]) / 255.0
+    pictures = rgba[..., :3] * rgba[..., 3:] + 0.5 * (1.0 - rgba[..., 3:])
     frames = []
     for number, (pose, picture) in enumerate(zip(c2w, pictures, strict=True)):
         flat = picture.reshape(size, 2, 2 * size, 3).mean(axis=1)

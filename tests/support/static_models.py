@@ -16,17 +16,9 @@ from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.part import fit_parts
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
-from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
-
-
-class StaticSampler(OccupancySampler):
-    """An occupancy grid that packs samples into a fixed capacity on every device, as it does on GPUs."""
-
-    def capacity_for(self, rays: RayBundle) -> int | None:
-        return self.capacity
 
 
 def fast_model(level=MaskedLevel, encoder: Encoder | None = None, **sampler) -> RadianceModel:

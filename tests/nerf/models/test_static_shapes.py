@@ -30,9 +30,9 @@ class Operations(TorchDispatchMode):
         return out
 
 
-def operations_of_steps(name, steps, model=None, loss=None):
+def operations_of_steps(name, steps, model=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    train_step = static_system(name, scene, progress, 100, model, loss).train_step
+    train_step = static_system(name, scene, progress, 100, model).train_step
     loader = RayBatches(scene, progress, 0, 64)
     # What is read once in a run (switches, the grid's content) is read on the host.
     begin_step(train_step.objective.model, StepContext(0.0, 4, 0))
