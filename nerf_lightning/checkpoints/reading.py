@@ -1,4 +1,4 @@
-"""What a checkpoint holds besides weights and optimizer, and how it is read: the file is self-contained.
+"""What a checkpoint holds besides weights and optimizer, how it is read, and which one of a run folder is read.
 
 A checkpoint consists of tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is
 executed. Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked

@@ -13,8 +13,8 @@ from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
 from nerf_lightning.runs.table import ORDERS, result_table
-from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns, write_csv, write_markdown
-from nerf_lightning.runs.table_latex import write_latex
+from nerf_lightning.runs.table_cells import DECIMALS, Row, shown_columns
+from nerf_lightning.runs.table_files import write_csv, write_latex, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 
 ENDINGS = (".md", ".csv", ".html", ".tex")

@@ -12,7 +12,15 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import Composed, compose_config
-from nerf_lightning.config.model_for_scene import IN_A_BOX, PHOTOGRAPHS, grid_for, model_for
+from nerf_lightning.config.model_for_scene import (
+    IN_A_BOX,
+    LARGE,
+    LARGE_CELLS,
+    PHOTOGRAPHS,
+    grid_for,
+    has_large_pictures,
+    model_for,
+)
 from nerf_lightning.config.overrides import SWITCH, key_of, leaves
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
@@ -49,8 +57,6 @@ SETTLED = (
     *(STEPS_SETTING, RAYS_SETTING, "data.batch_rays", "data.sample_budget"),
 )
 """What model=auto may set besides the model and the loss."""
-LARGE, LARGE_CELLS = "fast_large", 1024
-"""The model for large pictures of a scene in a box on a GPU, and the finest grid from which pictures are large."""
 SHORT_STEPS, LARGE_STEPS, LARGE_TABLE = 576, 1024, 20
 """For large pictures of a scene in a box: steps across it, and log2 of a hash table's entries.
 
@@ -183,15 +189,12 @@ def settled(config: Mapping[str, Any]) -> list[str]:
 
 def _for_scene(scene: Scene, typed: set[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
     """Return the model that suits a scene, with what suits the model, and log it."""
-    name, reason = model_for(scene)
-    large = _has_large_pictures(scene)
-    if large and on_gpu:
-        name, reason = LARGE, f"{reason}, the pictures are large, and there is a GPU"
+    name, reason = model_for(scene, on_gpu)
     log.info("model: %s, because %s (choose another with model=NAME)", name, reason)
     suited = [f"model={name}"]
     short = seconds is not None and seconds < (SHORT_GPU_SECONDS if on_gpu else SHORT_SECONDS)
     if name == IN_A_BOX and not on_gpu:
-        suited += _for_large_pictures(typed, short) if large else []
+        suited += _for_large_pictures(typed, short) if has_large_pictures(scene) else []
         suited += [] if short else _rays(typed)
     if name == PHOTOGRAPHS:
         suited += [*_grid_for_photographs(scene, typed, short), *_loss_for(scene, typed)]
@@ -202,14 +205,10 @@ def _as_begun(scene: Scene, typed: set[str], former: Mapping[str, Any]) -> list[
     """Return the model of a run that is resumed, and the numbers that were chosen for it."""
     name = model_for(scene)[0]
     numbers = [each for each in settled(former) if key_of(each) not in typed]
-    if _has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
+    if has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
         name = LARGE
     loss = _loss_for(scene, typed) if name == PHOTOGRAPHS else []
     return [f"model={name}", *loss, *numbers]
-
-
-def _has_large_pictures(scene: Scene) -> bool:
-    return model_for(scene)[0] == IN_A_BOX and grid_for(scene) >= LARGE_CELLS
 
 
 def _for_large_pictures(typed: set[str], short: bool) -> list[str]:

@@ -1,4 +1,4 @@
-"""Which model suits a scene, and how fine its hash grid should be: what model=auto goes by."""
+"""Which model suits a scene, and how fine its hash grid should be; `auto_settings.py` sets the rest of model=auto."""
 
 import math
 
@@ -11,15 +11,24 @@ CONTRACTED_SIDE = 4.0
 COARSEST_LEVEL, FINEST_LEVEL = 9, 12
 LEAST_DISTANCE = 0.1
 """Of a camera from what it shows, in units of the farthest camera's."""
-IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
-"""The models of model=auto."""
+IN_A_BOX, LARGE, PHOTOGRAPHS = "fast", "fast_large", "fast_proposal"
+"""The models of model=auto; LARGE is for large pictures of a scene in a box on a GPU."""
+LARGE_CELLS = 1024
+"""The finest grid from which pictures are large."""
 
 
-def model_for(scene: Scene) -> tuple[str, str]:
+def model_for(scene: Scene, on_gpu: bool = False) -> tuple[str, str]:
     """Return the model that suits a scene, as model=auto chooses it, and why."""
-    if scene.space == "bounded":
-        return IN_A_BOX, "the scene is in a box"
-    return PHOTOGRAPHS, "the photographs show a background"
+    if scene.space != "bounded":
+        return PHOTOGRAPHS, "the photographs show a background"
+    if on_gpu and has_large_pictures(scene):
+        return LARGE, "the scene is in a box, the pictures are large, and there is a GPU"
+    return IN_A_BOX, "the scene is in a box"
+
+
+def has_large_pictures(scene: Scene) -> bool:
+    """Return whether a scene is in a box, and its pictures are large."""
+    return scene.space == "bounded" and grid_for(scene) >= LARGE_CELLS
 
 
 def grid_for(scene: Scene) -> int:

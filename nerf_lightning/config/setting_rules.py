@@ -1,4 +1,4 @@
-"""Rules for settings, by group: one table for all code that treats settings differently.
+"""Rules for settings, by group: which must agree on resume (`identity`), and which a file may set (`Trust`).
 
 A group that is not in the table may be set only on the command line; a new reader, field, loss or callback has the row
 of its group. `x.*` is each key in the section x, and `x.**` is x and everything below it. The most specific entry

@@ -1,4 +1,4 @@
-"""Terminal output: lines on stdout, progress bars on stderr."""
+"""Terminal output: lines on stdout, progress bars on stderr; `conf/hydra/nerf.yaml` has the look of log lines."""
 
 import logging
 import sys

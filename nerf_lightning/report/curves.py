@@ -1,4 +1,4 @@
-"""Curves of a run, read from its TensorBoard files for a page, whose script draws them."""
+"""Curves of a run, read from its TensorBoard files for a page; `page.js` smooths and draws them."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""Find the run that a command resumes, and check that it has the same settings.
+"""Find the run that a command resumes, and check that its settings agree (`identity` in `config/setting_rules.py`).
 
 `checkpoints.reading.newest_checkpoint` chooses among its checkpoints.
 """

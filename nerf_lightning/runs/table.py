@@ -14,7 +14,7 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.runs.published import published_for
 from nerf_lightning.runs.results import FoundResults, RunResult
 from nerf_lightning.runs.summary import differing_keys
-from nerf_lightning.runs.table_files import Row
+from nerf_lightning.runs.table_cells import Row
 
 SPREAD = {
     "psnr": "PSNR",

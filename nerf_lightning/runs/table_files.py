@@ -1,4 +1,4 @@
-"""Rows of a table, written as Markdown for reading and as CSV with all digits.
+"""Rows of a table in files: Markdown for reading, CSV with all digits, LaTeX with the best numbers in bold.
 
 Texts from untrusted run folders stay text in a browser and a spreadsheet.
 """
@@ -10,18 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.escaping import for_csv, for_markdown
+from nerf_lightning.runs.table import HIGH_FIRST, PLAIN, SPREAD
+from nerf_lightning.runs.table_cells import Row, shown, shown_columns
 
-Row = dict[str, Any]
-
-DECIMALS = {
-    **{"PSNR": 2, "PSNR std": 2, "cc PSNR": 2, "cc PSNR std": 2, "seconds": 1, "minutes": 1},
-    **{"SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4, "steps": 0, "parameters": 0, "runs": 0},
-    **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
-}
-"""Columns of numbers, and their number of decimals."""
-SECONDS = {"seconds": 1, "minutes": 60}  # Columns of times, and their units in seconds
+HIGHEST = tuple((SPREAD | PLAIN)[key] for key in HIGH_FIRST)
+LOWEST = tuple(column for column in SPREAD.values() if column not in HIGHEST)
+"""Columns whose best value is the highest, or the lowest."""
+NOT_IN_PAPERS = ("job", "state", "folder", "source", "seeds")
+SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$",
+}  # fmt: skip
 
 
 def write_csv(rows: list[Row], path: Path) -> None:
@@ -39,36 +38,54 @@ def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> No
         part.write_text(text + "".join(f"\n{for_markdown(note)}\n" for note in notes), encoding="utf-8")
 
 
-def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
-    """Return the displayed texts of each column.
+def write_latex(rows: list[Row], path: Path, protocol: dict[str, Any]) -> None:
+    r"""Write a table for `\usepackage{booktabs}`; the caption states the runs' `protocol`."""
+    told = {name: cells for name, cells in shown_columns(rows).items() if name not in NOT_IN_PAPERS}
+    columns = {name: cells for name, cells in told.items() if name == "model" or len(set(cells)) > 1 or name in HIGHEST}
+    cells = {
+        name: _with_best_bold(name, [for_latex(cell) for cell in column], rows) for name, column in columns.items()
+    }
+    kinds = "".join("r" if name in (*HIGHEST, *LOWEST) else "l" for name in columns)
+    lines = [
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{for_latex(_caption(told, columns, protocol))}}}",
+        rf"\begin{{tabular}}{{{kinds}}}",
+        r"\toprule",
+        " & ".join(map(for_latex, columns)) + r" \\",
+        r"\midrule",
+        *(" & ".join(column[row] for column in cells.values()) + r" \\" for row in range(len(rows))),
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+    ]
+    with whole_file(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
-    Deviations follow their means, all times are in one column, and published results are marked.
+
+def for_latex(text: str) -> str:
+    r"""Return a text escaped for LaTeX, on one line.
+
+    >>> for_latex("a_b & 50% \\ {")
+    'a\\_b \\& 50\\% \\textbackslash{} \\{'
     """
-    columns: dict[str, list[str]] = {}
-    for name in rows[0]:
-        if name in SECONDS or name == "time":
-            columns["time"] = [_time(row) for row in rows]
-        elif not name.endswith(" std"):
-            deviations = [shown(row, f"{name} std") for row in rows]
-            pairs = zip(rows, deviations, strict=True)
-            columns[name] = [shown(row, name) + (f" ± {of}" if of else "") for row, of in pairs]
-    if "model" in columns:
-        columns["model"] = [f"{row['model']}{' (published)' if row.get('source') else ''}" for row in rows]
-    return columns
+    return " ".join("".join(SPECIAL.get(letter, letter) for letter in text if letter.isprintable()).split())
 
 
-def shown(row: Row, column: str) -> str:
-    """Return the displayed text of a value."""
-    value = row.get(column)
-    if value is None:
-        return ""
-    if column in DECIMALS and not isinstance(value, str):
-        return f"{value:,.{DECIMALS[column]}f}"
-    # Values that a sampler proposes have too many digits.
-    is_long_number = re.fullmatch(r"-?\d*\.\d{7,}(e-?\d+)?", str(value))
-    return f"{float(value):.6g}" if is_long_number else str(value)
+def _with_best_bold(name: str, cells: list[str], rows: list[Row]) -> list[str]:
+    known = [row[name] for row in rows if isinstance(row.get(name), int | float)]
+    if name not in (*HIGHEST, *LOWEST) or len(known) < 2:
+        return cells
+    best = max(known) if name in HIGHEST else min(known)
+    return [rf"\textbf{{{cell}}}" if row.get(name) == best else cell for cell, row in zip(cells, rows, strict=True)]
 
 
-def _time(row: Row) -> str:
-    times = (spoken(row[key] * seconds) for key, seconds in SECONDS.items() if row.get(key) is not None)
-    return next(times, row.get("time") or "")
+def _caption(shown: dict[str, list[str]], columns: dict[str, list[str]], protocol: dict[str, Any]) -> str:
+    """Return what all rows have in common, and how their pictures were compared."""
+    same = [f"{name} {cells[0]}" for name, cells in shown.items() if name not in columns and cells[0]]
+    told = f"{protocol.get('split', '')} views, {protocol.get('background', '')} background"
+    how = [f"PSNR: {protocol['psnr']}"] if "psnr" in protocol and "PSNR" in columns else []
+    how += [f"SSIM: {protocol['ssim']}"] if "ssim" in protocol and "SSIM" in columns else []
+    is_spread = any("±" in cell for column in columns.values() for cell in column)
+    spread = ["mean ± standard deviation over seeds"] if is_spread else []
+    return f"{'. '.join(re.sub(r'[.]$', '', part) for part in (', '.join([*same, told]), *how, *spread))}."

@@ -1,4 +1,4 @@
-"""Attempts of a run: their weights are drawn from seed and number, and a guard starts another if one fails."""
+"""Attempts of a run, with weights drawn from seed and number; collapse guard and NaN guard decide on another."""
 
 import torch
 from torch.optim import Optimizer

@@ -169,24 +169,26 @@ def targets(node, path=""):
     "group",
     [
         *("encoder", "field", "sampler", "loss", "correction", "scheduler", "scene", "path", "evaluation", "trainer"),
-        "what",
+        *("what", "callbacks"),
     ],
 )
 def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
     """The signature is the schema: a setting that exists can be seen in the yaml, and no key is read by nobody."""
     for option in options(group):
-        config = loaded(group, option)
-        if "_target_" not in config:
-            continue
-        target = config["_target_"]
-        try:
-            signature = inspect.signature(get_class(target))
-        except ValueError:
-            signature = inspect.signature(get_method(target))
-        # What its own defaults list chooses, by the key that it goes to.
-        chosen = {key.partition("@")[2] for each in config.get("defaults", []) if each != "_self_" for key in each}
-        named = (set(config) | chosen) - {"_target_", "_partial_", "defaults"}
-        assert named == set(signature.parameters) - {"args", "kwargs"}, f"{group}/{option}"
+        file = loaded(group, option)
+        for config in file.values() if group == "callbacks" else [file]:
+            if "_target_" not in config:
+                continue
+            target = config["_target_"]
+            try:
+                signature = inspect.signature(get_class(target))
+            except ValueError:
+                signature = inspect.signature(get_method(target))
+            # What its own defaults list chooses, by the key that it goes to.
+            listed = [each for each in config.get("defaults", []) if isinstance(each, DictConfig)]
+            chosen = {key.partition("@")[2] for each in listed for key in each}
+            named = (set(config) | chosen) - {"_target_", "_partial_", "defaults"}
+            assert named == set(signature.parameters) - {"args", "kwargs"}, f"{group}/{option}"
 
 
 ENCODER = {"_target_": "nerf_lightning.nerf.encoders.frequency.FrequencyEncoder", "num_frequencies": 2}

@@ -1,4 +1,7 @@
-"""How much memory a run takes at most: said before it starts, with what to lower where the room may be short."""
+"""How much memory a run takes at most: said before it starts, with what to lower.
+
+Where it runs out, `training/gradients/tiles.py` takes smaller tiles.
+"""
 
 import logging
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Scale cameras to the pixels that are read, and check that photographs fit their cameras."""
+"""Scale cameras to the pixels that are read, and turn photographs by their EXIF orientation if cameras need it."""
 
 import logging
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""The LLFF format: `poses_bounds.npy` next to folders of photographs (images, or shrunk ones such as images_4)."""
+"""The LLFF format: `poses_bounds.npy` next to folders of photographs (images, or shrunk ones such as images_4).
+
+Its bounds become near and far in `captures/frame_and_extent.py`.
+"""
 
 import logging
 import os

@@ -12,13 +12,10 @@ from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
-from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
+from nerf_lightning.nerf.samplers.base import OPAQUE_BELOW, DenseSampler, Sampler
 from nerf_lightning.nerf.types.rays import Points, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
-
-OPAQUE_BELOW = 1e-3
-"""Rays end where their transmittance falls below this, as those of a `RaggedSampler`."""
 
 
 class DenseLevel(Level):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
 from nerf_lightning.nerf.kernels.backends import with_kernel
+from nerf_lightning.nerf.kernels.histograms.op import FLOOR
 from nerf_lightning.nerf.kernels.search import search
 
 
@@ -17,7 +18,7 @@ def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
-    floor: float = 1e-5,
+    floor: float = FLOOR,
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"]:
     """Return where the cumulative distribution of a histogram reaches `u` (Sec. 5.2, arXiv 2003.08934).

@@ -15,6 +15,8 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 """A function from positions to a field's density (per unit length)."""
+OPAQUE_BELOW = 1e-3
+"""Rays end where their transmittance falls below this, unless a sampler's `opaque_below` says otherwise."""
 
 
 class Sampler(Part):
@@ -61,7 +63,7 @@ class RayMarcher(ABC):
 class RaggedSampler(Sampler, ABC):
     """Choose intervals along rays, only where there may be something: their number differs from ray to ray."""
 
-    opaque_below: float = 1e-3
+    opaque_below: float = OPAQUE_BELOW
     """A ray's samples end where its transmittance falls below this; 0 keeps them all."""
     found_per_visible: int = 4
     """Approximate number of samples found per visible one, after a minute of training (instant-ngp expects 16)."""

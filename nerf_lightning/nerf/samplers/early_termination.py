@@ -1,4 +1,4 @@
-"""Early termination: samples behind opaque ones are neither counted nor given a color."""
+"""Early termination: samples behind opaque ones (`sampler.opaque_below`) are neither counted nor given a color."""
 
 import torch
 from jaxtyping import Float

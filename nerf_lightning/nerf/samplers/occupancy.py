@@ -15,7 +15,7 @@ from nerf_lightning.nerf.kernels.march.op import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.samplers.base import DensityFn, RaggedSampler, RayMarcher
+from nerf_lightning.nerf.samplers.base import OPAQUE_BELOW, DensityFn, RaggedSampler, RayMarcher
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
@@ -70,7 +70,7 @@ class OccupancySampler(RaggedSampler):
         prune_after: int = 0,
         decay: float = 0.8,
         min_alpha: float = 0.01,
-        opaque_below: float = 1e-3,
+        opaque_below: float = OPAQUE_BELOW,
         capacity: int | None = None,
     ):
         super().__init__()

@@ -1,4 +1,7 @@
-"""The grid of an occupancy sampler: where its cells are, and what is known of each."""
+"""The grid of an occupancy sampler: where its cells are, and what is known of each.
+
+`occupancy.py` chooses which cells are updated, and when.
+"""
 
 from typing import Any
 

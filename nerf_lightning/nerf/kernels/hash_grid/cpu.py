@@ -15,8 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
-from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
+from nerf_lightning.nerf.kernels.hash_grid.layout import PRIME_Y, PRIME_Z, HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 POINTS = 64

@@ -12,11 +12,12 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.layout import PRIME_Y, PRIME_Z, HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.padding import end_of_rows
 
 BLOCK = 128
+SPREAD_Y, SPREAD_Z = tl.constexpr(PRIME_Y), tl.constexpr(PRIME_Z)
 
 
 def forward(
@@ -118,7 +119,7 @@ def _cell(points, row, axis, valid, resolution):
 @triton.jit
 @no_type_check
 def _entry(x, y, z, resolution, offset, hashed, mask):
-    spread = x.to(tl.uint32) ^ (y.to(tl.uint32) * 2654435761) ^ (z.to(tl.uint32) * 805459861)
+    spread = x.to(tl.uint32) ^ (y.to(tl.uint32) * SPREAD_Y) ^ (z.to(tl.uint32) * SPREAD_Z)
     side = resolution + 1
     dense = x + side * (y + side * z)
     return offset + tl.where(hashed != 0, (spread & mask).to(tl.int32), dense)

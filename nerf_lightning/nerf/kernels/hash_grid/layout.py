@@ -5,6 +5,9 @@ Letters: R_l the cells along a side of level l, T the maximum number of entries 
 
 from dataclasses import dataclass
 
+PRIME_Y, PRIME_Z = 2654435761, 805459861
+"""Primes of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table size (Eq. 4)."""
+
 
 @dataclass(frozen=True)
 class HashGridLayout:

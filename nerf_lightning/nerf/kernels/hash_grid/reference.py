@@ -4,10 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
-
-PRIME_Y, PRIME_Z = 2654435761, 805459861
-"""Primes of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table size (Eq. 4)."""
+from nerf_lightning.nerf.kernels.hash_grid.layout import PRIME_Y, PRIME_Z, HashGridLayout
 
 
 def interpolate_torch(

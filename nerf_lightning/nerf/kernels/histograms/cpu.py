@@ -13,7 +13,14 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
-from nerf_lightning.nerf.kernels.histograms.op import RayLoss, distortion, interlevel, takes_bounds, takes_histogram
+from nerf_lightning.nerf.kernels.histograms.op import (
+    FLOOR,
+    RayLoss,
+    distortion,
+    interlevel,
+    takes_bounds,
+    takes_histogram,
+)
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -25,7 +32,7 @@ def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
-    floor: float = 1e-5,
+    floor: float = FLOOR,
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""

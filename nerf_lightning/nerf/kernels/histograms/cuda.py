@@ -14,7 +14,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
-from nerf_lightning.nerf.kernels.histograms.op import RayLoss, distortion, interlevel, takes_bounds, takes_histogram
+from nerf_lightning.nerf.kernels.histograms.op import (
+    FLOOR,
+    RayLoss,
+    distortion,
+    interlevel,
+    takes_bounds,
+    takes_histogram,
+)
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 LANES = 32
@@ -26,7 +33,7 @@ def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
-    floor: float = 1e-5,
+    floor: float = FLOOR,
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""

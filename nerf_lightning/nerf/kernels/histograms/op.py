@@ -9,6 +9,9 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
+FLOOR = 1e-5
+"""Mass added to each bin of a histogram, unless its sampler says otherwise: an empty ray is sampled evenly."""
+
 
 class RayLoss(torch.autograd.Function):
     """Apply it to the function that computes, the weights that have a gradient, and the loss's other inputs."""

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
-from nerf_lightning.nerf.kernels.mlp import tiles
+from nerf_lightning.nerf.kernels.mlp import cpu_torch
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, linear
 
 
@@ -67,7 +67,7 @@ def _kernels_for(
         cpu_backend("mlp.cpu", points.device),
         torch.bfloat16 if matmul_precision == "bfloat16" else points.dtype,
     )
-    return (kernels if kernels is not None and kernels.takes(weights, dtype) else tiles), dtype
+    return (kernels if kernels is not None and kernels.takes(weights, dtype) else cpu_torch), dtype
 
 
 class _TiledMLP(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""The MLP for the CPU: tiles of rows, on our own threads instead of torch's, as many as torch has.
+"""The MLP for the CPU by torch's products: tiles of rows, on our own threads instead of torch's, as many as torch has.
 
 The tiles and the order of their sums are fixed, so the result does not depend on the number of threads.
 """
