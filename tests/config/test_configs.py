@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import pytest
 import torch
+import yaml
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
@@ -13,9 +14,10 @@ from support.configs import composed, loaded, options
 from nerf_lightning.checkpoints.trusted_classes import names_of
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.hydra_versions import IS_1_3, instantiate
-from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.instantiate import build, require_kinds
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.budgets import Budgets
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = (
@@ -189,6 +191,23 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
             chosen = {key.partition("@")[2] for each in listed for key in each}
             named = (set(config) | chosen) - {"_target_", "_partial_", "defaults"}
             assert named == set(signature.parameters) - {"args", "kwargs"}, f"{group}/{option}"
+
+
+@pytest.mark.parametrize(
+    ("command", "override", "kind"),
+    [
+        ("report", "max_megabytes=many", "a number"),
+        ("table", "force=3", "true or false"),
+        ("train", "seed=null", "a number"),
+        ("bench", "rounds=true", "a number"),
+    ],
+)
+def test_a_commands_own_numbers_and_switches_take_no_other_kind(command, override, kind):
+    key, _, value = override.partition("=")
+    config = composed(command)
+    OmegaConf.update(config, key, yaml.safe_load(value))
+    with pytest.raises(InputError, match=f"^{key}=\\w+ is not valid: it must be {kind}"):
+        require_kinds(config, command)
 
 
 ENCODER = {"_target_": "nerf_lightning.nerf.encoders.frequency.FrequencyEncoder", "num_frequencies": 2}
