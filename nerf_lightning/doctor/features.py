@@ -55,7 +55,7 @@ def small_picture(pixels: PixelStore, view: int, width: int, height: int) -> Flo
     """Return a view's colors (0 to 1) at another size; transparent or masked pixels are middle gray."""
     rgba = pixels.view(view).float().permute(2, 0, 1) / 255
     cover = rgba[3]
-    kept = pixels.kept(view)
+    kept = pixels.view_mask(view)
     if kept is not None:
         cover = cover * kept
     rgb = 0.5 + (rgba[:3] - 0.5) * cover
@@ -166,7 +166,7 @@ class Looks:
 def look_at_view(pixels: PixelStore, view: int, picture: Float[Tensor, "3 height width"]) -> tuple[Tensor, ...]:
     """Return one view's row, in the order of the fields; `picture` is the shrunk view."""
     rgba = pixels.view(view)
-    kept = pixels.kept(view)
+    kept = pixels.view_mask(view)
     edge = torch.cat([rgba[0], rgba[-1], rgba[:, 0], rgba[:, -1]])[:, :3].float()
     median = edge.median(dim=0).values
     even = ((edge - median).abs().amax(dim=-1) <= 2).float().mean()
@@ -189,7 +189,7 @@ def fineness_of(pixels: PixelStore, view: int) -> Float[Tensor, "directions"]:
     half of what is neither transparent nor masked. Camera motion reduces it along one direction only. NaN: there is too
     little texture.
     """
-    rgba, kept = pixels.view(view), pixels.kept(view)
+    rgba, kept = pixels.view(view), pixels.view_mask(view)
     solid = rgba[..., 3] > 252 if kept is None else (rgba[..., 3] > 252) & kept
     both = torch.stack([rgba[..., 1] / 255, solid.float()])
     share = SHARP_SIDE / max(rgba.shape[:2])

@@ -74,7 +74,7 @@ def warn_of_faults(scene: Scene) -> None:
 
 def _nothing(pixels: PixelStore, view: int) -> str | None:
     """Return what replaces a picture: one color, or nothing at all; None if it is a picture."""
-    rgba, kept = pixels.view(view), pixels.kept(view)
+    rgba, kept = pixels.view(view), pixels.view_mask(view)
     for step in (max(1, len(rgba) // ROWS), 1):
         part = rgba[::step].reshape(-1, 4) if kept is None else rgba[::step][kept[::step]]
         seen = part[part[:, 3] > 0, :3]

@@ -43,7 +43,7 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
     optimizer = torch.optim.Adam(motion.parameters(), lr=FIRST_RATE)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_RATE / FIRST_RATE) ** (1.0 / NUM_STEPS))
     objective = Objective(model, rays_of, MeanSquaredError(), background)
-    rgba, kept = scene.pixels.view(view), scene.pixels.kept(view)
+    rgba, kept = scene.pixels.view(view), scene.pixels.view_mask(view)
     shown = None if kept is None or not bool(kept.any()) else kept.flatten().nonzero()[:, 0]
     count, width = rgba[..., 0].numel() if shown is None else len(shown), rgba.shape[1]
     draw = torch.Generator().manual_seed(view)

@@ -17,7 +17,7 @@ HALF_A_LEVEL = 0.5 / 255
 def color_corrected(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],
-    kept: Bool[Tensor, "height width"] | None = None,
+    mask: Bool[Tensor, "height width"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
     """Return A c + b for each color c of a render, with the A (3 x 3) and b of least squared error.
 
@@ -26,13 +26,13 @@ def color_corrected(
     Args:
         render: the picture to judge.
         truth: the photograph.
-        kept: pixels that count; None: all. Fewer than 8 leave the render as it is.
+        mask: pixels that count; None: all. Fewer than 8 leave the render as it is.
     """
 
     def counted(picture: Tensor, rows: slice) -> Tensor:
-        return (picture[rows] if kept is None else picture[rows][kept[rows]]).double().reshape(-1, 3)
+        return (picture[rows] if mask is None else picture[rows][mask[rows]]).double().reshape(-1, 3)
 
-    count = render[..., 0].numel() if kept is None else int(kept.sum())
+    count = render[..., 0].numel() if mask is None else int(mask.sum())
     if count < FEWEST:
         return render
     parts = list(row_chunks(*render.shape[:2]))
@@ -51,9 +51,9 @@ def color_corrected(
     return corrected
 
 
-def is_one_color(picture: Float[Tensor, "height width 3"], kept: Bool[Tensor, "height width"] | None = None) -> bool:
+def is_one_color(picture: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"] | None = None) -> bool:
     """Return whether the pixels that count, if any, differ by less than half a level of 255 in every channel."""
-    colors = picture.reshape(-1, 3) if kept is None else picture[kept]
+    colors = picture.reshape(-1, 3) if mask is None else picture[mask]
     return not len(colors) or bool((colors.amax(dim=0) - colors.amin(dim=0) < HALF_A_LEVEL).all())
 
 
@@ -81,7 +81,7 @@ def exposure_fitted(
 
     foreground = render if background is None else render - (1.0 - opacity[..., None]) * background
 
-    def shown(stops: Tensor, *parts: Tensor) -> Tensor:
+    def exposed(stops: Tensor, *parts: Tensor) -> Tensor:
         return in_other_light(lambda straight: scale_light(straight, torch.exp2(stops)), *parts)
 
     stops = torch.zeros(3, device=render.device, requires_grad=True)
@@ -90,10 +90,10 @@ def exposure_fitted(
 
     def error() -> float:
         optimizer.zero_grad()
-        squared = (shown(stops, *ours) - true).square().mean()
+        squared = (exposed(stops, *ours) - true).square().mean()
         squared.backward()
         return float(squared.detach())
 
     with torch.enable_grad():
         optimizer.step(error)
-    return shown(stops.detach(), render, foreground, opacity)
+    return exposed(stops.detach(), render, foreground, opacity)

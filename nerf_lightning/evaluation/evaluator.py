@@ -147,7 +147,7 @@ class Scoring:
     def _compare(
         self, picture: Picture, scene: Scene, view: int, background: Background, depth_range: tuple[float, float]
     ) -> tuple[dict[str, Any], ScoredView]:
-        truth, kept = photograph(scene, view, background), scene.pixels.kept(view)
+        truth, kept = photograph(scene, view, background), scene.pixels.view_mask(view)
         scored = slice(None)
         if self.colors == "half_fit":
             scored = slice(truth.shape[1] // 2, None)
@@ -198,7 +198,7 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
     start = int(scene.pixels.offset[view])
     part = slice(start, start + picture.depth.numel())
     alpha = (scene.pixels.rgba[part, 3].float() / 255.0).view(shape)
-    kept = scene.pixels.kept(view)
+    kept = scene.pixels.view_mask(view)
     if kept is not None:
         alpha = alpha * kept  # only fully covered pixels are scored
     truth = scene.truth(view)

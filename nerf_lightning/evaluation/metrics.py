@@ -26,17 +26,17 @@ HIGHER_IS_BETTER = ("psnr", "cc_psnr", "ssim")
 def masked_out(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],
-    kept: Bool[Tensor, "height width"] | None,
+    mask: Bool[Tensor, "height width"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Return the render with the truth's colors where a pixel is not kept, so that there is no difference there."""
-    return render if kept is None else torch.where(kept[..., None], render, truth)
+    """Return the render with the truth's colors outside the mask, so that there is no difference there."""
+    return render if mask is None else torch.where(mask[..., None], render, truth)
 
 
 @disable_autocast
 def image_metrics(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],
-    kept: Bool[Tensor, "height width"] | None = None,
+    mask: Bool[Tensor, "height width"] | None = None,
 ) -> dict[str, float | None]:
     """Return `psnr` (dB), `cc_psnr` and `ssim` of one image; the render is clamped to [0, 1] first.
 
@@ -49,14 +49,14 @@ def image_metrics(
     Args:
         render: the picture to judge.
         truth: the photograph.
-        kept: pixels that count, at least one; None: all. PSNR is over these pixels. For SSIM, which depends on
+        mask: pixels that count, at least one; None: all. PSNR is over these pixels. For SSIM, which depends on
             neighbors, the others take the photograph's colors.
     """
-    render = masked_out(render.clamp(0, 1), truth, kept)
-    fits = not (is_one_color(render, kept) or is_one_color(truth, kept))
+    render = masked_out(render.clamp(0, 1), truth, mask)
+    fits = not (is_one_color(render, mask) or is_one_color(truth, mask))
     return {
-        "psnr": picture_psnr(render, truth, kept),
-        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp_(0, 1), truth, kept) if fits else None,
+        "psnr": picture_psnr(render, truth, mask),
+        "cc_psnr": picture_psnr(color_corrected(render, truth, mask).clamp_(0, 1), truth, mask) if fits else None,
         "ssim": _similarity(render, truth) if min(render.shape[:2]) >= SSIM_WINDOW else None,
     }
 

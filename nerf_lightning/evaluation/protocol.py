@@ -74,7 +74,7 @@ def split_hash(scene: Scene, views: list[int]) -> str:
     for view in views:
         digest.update(scene.view_names[view].encode("utf-8", "surrogatepass"))
         digest.update(scene.pixels.view(view).contiguous().numpy().tobytes())
-        kept = scene.pixels.kept(view)
+        kept = scene.pixels.view_mask(view)
         if kept is not None:
             digest.update(kept.numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -70,14 +70,14 @@ class ImagesExport(Export):
         farthest, channels = 0.0, dict[str, Path]()
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):
-                seen = see(model, record, record.cameras, view, tile_points)
-                depth = self._depth(seen, record, view, run.min_opacity)
+                rendered = see(model, record, record.cameras, view, tile_points)
+                depth = self._depth(rendered, record, view, run.min_opacity)
                 _save_array(child_of(depths, names[view], ending=".npy"), depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
-                save_png(child_of(opacities, names[view], ending=".png"), to_bytes(seen.opacity))
-                normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
+                save_png(child_of(opacities, names[view], ending=".png"), to_bytes(rendered.opacity))
+                normals = 0.5 + 0.5 * directions_to_user(rendered.normals.double(), record.to_user.double())
                 save_png(child_of(directions, names[view], ending=".png"), to_bytes(normals))
-                for name, values in seen.channels.items():
+                for name, values in rendered.channels.items():
                     channels[name] = make_folder(folder, name)
                     _save_array(child_of(channels[name], names[view], ending=".npy"), values.numpy())
                 report("pictures", (number + 1) / len(views))
@@ -102,12 +102,12 @@ class ImagesExport(Export):
         return evenly_spaced_subset(views, self.max_views or len(views))
 
     def _depth(
-        self, seen: SeenView, record: SceneRecord, view: int, min_opacity: float
+        self, rendered: SeenView, record: SceneRecord, view: int, min_opacity: float
     ) -> Float[ndarray, "height width"]:
-        depth = seen.depth
+        depth = rendered.depth
         if self.depth == "z":
-            depth = -camera_coordinates(record.cameras, view, seen.points)[..., 2]
-        opaque = seen.surface_depth(min_opacity).isfinite()
+            depth = -camera_coordinates(record.cameras, view, rendered.points)[..., 2]
+        opaque = rendered.surface_depth(min_opacity).isfinite()
         return torch.where(opaque, told_length(record)[0] * depth.double(), torch.nan).float().numpy()
 
     def _described(self, record: SceneRecord, names: dict[int, str], scale: float) -> dict[str, Any]:

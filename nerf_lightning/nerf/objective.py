@@ -105,7 +105,7 @@ class Objective(Part):
         self.loss, self.background = loss, background
 
     @property
-    def together(self) -> int:
+    def pixels_per_patch(self) -> int:
         """Number of consecutive pixels that no tile or process may separate: those of a patch."""
         return self.loss.patch**2
 

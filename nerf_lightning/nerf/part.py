@@ -41,7 +41,7 @@ class Part(nn.Module):
 
     couples_rays: bool = False
     """Whether a ray's result depends on the other rays of a step; tiles and processes must not split them. (For pixels
-    that a loss needs together, see `Objective.together`.)"""
+    that a loss needs together, see `Objective.pixels_per_patch`.)"""
 
     step_variant: Hashable = None
     """What the host has decided for the next step that changes its kernels."""

@@ -24,12 +24,12 @@ def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
 def picture_psnr(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],
-    kept: Bool[Tensor, "height width"] | None = None,
+    mask: Bool[Tensor, "height width"] | None = None,
 ) -> float:
-    """Return the PSNR (dB) of a picture over the kept pixels (at least one; None: all)."""
+    """Return the PSNR (dB) of a picture over the pixels of a mask (at least one; None: all)."""
     total, count = 0.0, 0
     for rows in row_chunks(*render.shape[:2]):
         error = (render[rows] - truth[rows]).square()
-        error = error if kept is None else error[kept[rows]]
+        error = error if mask is None else error[mask[rows]]
         total, count = total + float(error.sum(dtype=torch.float64)), count + error.numel()
-    return float(psnr(torch.tensor(total, dtype=torch.float64) / count))  # NaN if none is kept
+    return float(psnr(torch.tensor(total, dtype=torch.float64) / count))  # NaN if the mask is empty

@@ -146,7 +146,7 @@ class StepwiseRun(Run):
             callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without one
             loops=loops_after(0),
             progress=train_step.progress,
-            together=train_step.objective.together,
+            together=train_step.objective.pixels_per_patch,
         )
         restore_run(state, train_step, train_step.device)
         self.system.load_state_dict(content["state_dict"])

@@ -59,22 +59,22 @@ def carried_out(check: Check) -> Row:
     return Row(check.name, difference, check.bound, "ok" if fits else "wrong", check.because)
 
 
-def relative(found: Tensor, expected: Tensor) -> float:
+def relative(actual: Tensor, expected: Tensor) -> float:
     """Return the largest difference of two tensors over the largest expected value; NaN if a value is.
 
     >>> relative(Tensor([1.0, 2.5]), Tensor([1.0, 2.0]))
     0.25
     """
-    if found.shape != expected.shape:
-        raise ValueError(f"the result has the shape {tuple(found.shape)}, and {tuple(expected.shape)} is expected")
-    found, expected = found.detach().cpu().double(), expected.detach().cpu().double()
-    return float((found - expected).abs().max() / expected.abs().max().clamp(min=1e-30))
+    if actual.shape != expected.shape:
+        raise ValueError(f"the result has the shape {tuple(actual.shape)}, and {tuple(expected.shape)} is expected")
+    actual, expected = actual.detach().cpu().double(), expected.detach().cpu().double()
+    return float((actual - expected).abs().max() / expected.abs().max().clamp(min=1e-30))
 
 
-def norm_apart(found: Tensor, expected: Tensor) -> float:
+def norm_apart(actual: Tensor, expected: Tensor) -> float:
     """Return the norm of a difference over the norm of the expected value; NaN if a number is."""
-    found, expected = found.detach().cpu().double(), expected.detach().cpu().double()
-    return float((found - expected).norm() / expected.norm().clamp(min=1e-30))
+    actual, expected = actual.detach().cpu().double(), expected.detach().cpu().double()
+    return float((actual - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 def value_bound(matmul_precision: MatmulPrecision, layers: int) -> float:

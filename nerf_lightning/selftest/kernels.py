@@ -42,8 +42,8 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
         Check(f"{backend} ({library}): compiles and runs", 0.0, "or torch works", partial(_loads, backend))
         for backend in names
     ]
-    for place, (what, terms) in enumerate(HASH_GRID_SUMS.items()):
-        compare = partial(_hash_grid, device, place)
+    for index, (what, terms) in enumerate(HASH_GRID_SUMS.items()):
+        compare = partial(_hash_grid, device, index)
         found.append(Check(f"hash grid: {what}", terms * ROUNDING, f"{terms} roundings of float32", compare))
     found.append(Check("march: rays with other intervals", 0.01, face, partial(_march, device)))
     for what in BOUNDS:
@@ -72,15 +72,15 @@ def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(20260101)
 
 
-def _results(function: Callable[..., Sequence[Tensor]], given: Sequence[Tensor]) -> dict[str, list[Tensor]]:
+def _results(function: Callable[..., Sequence[Tensor]], inputs: Sequence[Tensor]) -> dict[str, list[Tensor]]:
     """Return the value of a function, and its gradients with respect to its arguments under random weights."""
-    leaves, random = [each.detach().clone().requires_grad_() for each in given], _generator()
+    leaves, random = [each.detach().clone().requires_grad_() for each in inputs], _generator()
     out = function(*leaves)
     torch.autograd.backward(out, [torch.randn(each.shape, generator=random).to(each) for each in out])
     return {"value": list(out), "gradients": [leaf.grad for leaf in leaves if leaf.grad is not None]}
 
 
-def _hash_grid(device: torch.device, place: int) -> float:
+def _hash_grid(device: torch.device, index: int) -> float:
     """Compare the features (0), the table's gradient (1) or the points' (2)."""
     layout, random = hash_grid_layout(8, 14, 16, 512), _generator()
     # Multiples of 1/4096: their cells and weights are exact in float32, so no point changes its cell.
@@ -88,9 +88,9 @@ def _hash_grid(device: torch.device, place: int) -> float:
     given = [torch.randn(layout.offsets[-1], 4, generator=random), points]
     found = _results(lambda t, p: [interpolate(t, p, layout)], [each.to(device) for each in given])
     exact = _results(lambda t, p: [interpolate_torch(t, p, layout)], [each.double() for each in given])
-    ours, expected = ([*each["value"], *each["gradients"]][place].cpu() for each in (found, exact))
+    ours, expected = ([*each["value"], *each["gradients"]][index].cpu() for each in (found, exact))
     # On the cube's faces, the derivative with respect to the points has two values.
-    kept = ((points > 0) & (points < 1)).all(dim=-1) if place == 2 else slice(None)
+    kept = ((points > 0) & (points < 1)).all(dim=-1) if index == 2 else slice(None)
     return relative(ours[kept], expected[kept])
 
 

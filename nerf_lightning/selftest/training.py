@@ -165,11 +165,11 @@ def reference_psnr(method: str) -> float:
         return Training(method, CPU, "float32", None).psnr()
 
 
-def gradients_apart(found: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
+def gradients_apart(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
     """Return the norm of the difference of all of a model's gradients, over the norm of the expected ones."""
-    if found.keys() != expected.keys():
-        raise ValueError(f"gradients of {sorted(found.keys() ^ expected.keys())} are there in one and not in the other")
-    ours, theirs = (torch.cat([each[name].cpu().flatten() for name in expected]) for each in (found, expected))
+    if names := actual.keys() ^ expected.keys():
+        raise ValueError(f"gradients of {sorted(names)} are there in one and not in the other")
+    ours, theirs = (torch.cat([each[name].cpu().flatten() for name in expected]) for each in (actual, expected))
     return norm_apart(ours, theirs)
 
 

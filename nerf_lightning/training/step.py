@@ -98,7 +98,7 @@ class TrainStep:
         with self.tiles.on_threads(self.device):
             optimizer.zero_grad()
             begin_step(objective, StepContext(progress.step / self.num_steps, progress.step, self.key))
-            first = ranks.share(progress.batch_rays // objective.together).start * objective.together
+            first = ranks.share(progress.batch_rays // objective.pixels_per_patch).start * objective.pixels_per_patch
             share = Share(first, progress.batch_rays, ranks.total(batch.weight.sum()))
             seen = self.gradients(batch, self.key, share, backward)
             ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
@@ -125,7 +125,7 @@ class TrainStep:
         ranks.average(buffers_to_average(model))
         if self.sample_budget is not None:
             wanted = self.sample_budget / model.points_per_ray(training=True)
-            progress.batch_rays = batch_size(progress.largest_batch, wanted, self.objective.together)
+            progress.batch_rays = batch_size(progress.largest_batch, wanted, self.objective.pixels_per_patch)
 
     def begin_recording(self) -> None:
         """Record and replay steps from now on, if requested and possible.

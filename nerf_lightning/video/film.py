@@ -57,9 +57,11 @@ def film(
     frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form, [FILMS["rgb"]] * settings.alpha)
     try:
         # Only the first process looks, before any of them writes.
-        missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
+        missing, depth_limits = ranks.from_first(
+            lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots))
+        )
         if "depth" in settings.outputs and ranks.is_first():
-            log.info("depth is in %s, mostly from %.3g to %.3g", told_length(first)[1], *seen)
+            log.info("depth is in %s, mostly from %.3g to %.3g", told_length(first)[1], *depth_limits)
         for number in tracked(ranks.every_other(missing), "filming"):
             if settings.form == "exr":
                 view = shots[0].picture(number)
@@ -67,7 +69,7 @@ def film(
                 channels = exr_channels(view, depth, "rgb" in settings.outputs, settings.alpha)
                 frames.save("exr", number, partial(save_exr, channels=channels, unit=told_length(first)[1]))
             else:
-                for name, picture in _frame(shots, settings, number, seen).items():
+                for name, picture in _frame(shots, settings, number, depth_limits).items():
                     frames.save(name, number, partial(save_png, picture=picture))
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
@@ -77,12 +79,14 @@ def film(
     return frames.results()
 
 
-def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ _"]]:
+def _frame(
+    shots: list[Shot], settings: FilmSettings, number: int, depth_limits: Range
+) -> dict[str, UInt8[Tensor, "_ _ _"]]:
     panels = []
     for shot in shots:
         picture = shot.picture(number)
         normals = shot.normals(number, picture) if "normals" in settings.outputs else None
-        panels.append({name: panel(name, picture, seen, shot.unit, normals) for name in settings.outputs})
+        panels.append({name: panel(name, picture, depth_limits, shot.unit, normals) for name in settings.outputs})
     pictures = film_pictures(panels, [shot.subject.label for shot in shots], settings.mosaic)
     if settings.alpha:
         pictures[FILMS["rgb"]] = straight_colors(picture.rgb, picture.opacity)

@@ -58,19 +58,19 @@ class FilmFrames:
         If the frames belong to another film, they are removed, and the range is measured again. A folder that another
         process writes to, or that has foreign files, is refused.
         """
-        with self._kept():
+        with self._catch_os_errors():
             self.scratch.hold()
             kept = [] if ENDINGS[self.form] else self.films
             results = [make_ours(self.folder, film, files=self._pattern) for film in kept]
         about = self.scratch.path / "film.json"
         note = read_json_object(about)
         if note.get("fingerprint") != fingerprint or not _is_range(note.get("depth_range")):
-            with self._kept():
+            with self._catch_os_errors():
                 empty_ours(self.scratch.path)
                 for folder in results:
                     empty_ours(folder, self._pattern)
             note = {"fingerprint": fingerprint, "depth_range": list(measure())}
-            with self._kept():
+            with self._catch_os_errors():
                 write_json(about, note)
         missing = [number for number in range(self.count) if not self._is_there(number)]
         if len(missing) < self.count:
@@ -126,7 +126,7 @@ class FilmFrames:
                 raise InputError(f"The frame {file} cannot be read. Remove it.") from error
 
     @contextmanager
-    def _kept(self) -> Iterator[None]:
+    def _catch_os_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -136,7 +136,7 @@ class FilmFrames:
     @contextmanager
     def _resumable(self) -> Iterator[None]:
         try:
-            with self._kept():
+            with self._catch_os_errors():
                 yield
         except InputError as error:
             there = sum(map(self._is_there, range(self.count)))

@@ -71,39 +71,39 @@ def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
 
 
 def _draw_cameras(
-    axes: "Axes", scene: Scene, content: Float[Tensor, "points 3"], shown: tuple[int, int], title: str
+    axes: "Axes", scene: Scene, content: Float[Tensor, "points 3"], dims: tuple[int, int], title: str
 ) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
     centers = scene.cameras.c2w[:, :, 3]
     middle = middle_of(scene)
     size = float((centers - middle).norm(dim=-1).max().clamp(min=1e-6))
-    x, y = content[:, shown].numpy().T
+    x, y = content[:, dims].numpy().T
     axes.scatter(x, y, s=2.0, color=CONTENT, alpha=0.45, linewidths=0, zorder=1)
     if scene.space == "bounded":
-        low, high = scene.aabb[:, shown].numpy()
+        low, high = scene.aabb[:, dims].numpy()
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
         axes.add_collection(PolyCollection([corners], facecolor="none", edgecolor=BOX, linewidth=1.6, label="box"))
     for split, views in _splits(scene).items():
-        lines = np.concatenate([_frustum(scene, view, 0.13 * size)[:, :, shown] for view in views])
+        lines = np.concatenate([_frustum(scene, view, 0.13 * size)[:, :, dims] for view in views])
         axes.add_collection(LineCollection(list(lines), colors=COLOURS[split], linewidths=0.8, alpha=0.8, zorder=2))
         label = f"{split} ({len(views)})"
-        x, y = centers[views][:, shown].numpy().T
+        x, y = centers[views][:, dims].numpy().T
         axes.scatter(x, y, s=9, color=COLOURS[split], label=label, zorder=3)
-    everything = torch.cat([centers[:, shown], middle[None, shown]]).numpy()
+    everything = torch.cat([centers[:, dims], middle[None, dims]]).numpy()
     if scene.space == "bounded":
-        everything = np.concatenate([everything, scene.aabb[:, shown].numpy()])
+        everything = np.concatenate([everything, scene.aabb[:, dims].numpy()])
     if len(content):
-        inner = content[:, shown].numpy()
+        inner = content[:, dims].numpy()
         everything = np.concatenate([everything, np.quantile(inner, [0.03, 0.97], axis=0)])
     low, high = everything.min(axis=0) - 0.15 * size, everything.max(axis=0) + 0.15 * size
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
-    if shown == (0, 2) and scene.space == "ndc":
+    if dims == (0, 2) and scene.space == "ndc":
         axes.invert_yaxis()
     axes.set_aspect("equal", adjustable="box")
     axes.grid(True, color="0.93", linewidth=0.8, zorder=0)
-    _style(axes, title, f"{'xyz'[shown[0]]} (scene units)", "xyz"[shown[1]])
+    _style(axes, title, f"{'xyz'[dims[0]]} (scene units)", "xyz"[dims[1]])
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
 
 

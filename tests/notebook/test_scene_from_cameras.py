@@ -35,7 +35,7 @@ def test_images_are_bytes_or_shares_with_or_without_alpha_and_masks_keep_what_is
     masks, images = orbit_masks(6, SIZE), orbit_images(6, SIZE)
     scene = nl.scene_from_cameras(images, orbit_cameras(), masks=masks)
     assert scene.pixels.view(2)[..., :3].numpy().tolist() == images[2].tolist()
-    assert scene.pixels.kept(2).numpy().tolist() == masks[2].tolist()
+    assert scene.pixels.view_mask(2).numpy().tolist() == masks[2].tolist()
     assert not scene.pixels.has_transparency
     shares = nl.scene_from_cameras(torch.from_numpy(images).float() / 255, orbit_cameras())
     assert torch.equal(shares.pixels.rgba, scene.pixels.rgba)

@@ -261,7 +261,7 @@ def photograph_hashes(pixels: PixelStore) -> Int[Tensor, "views"]:
     step = 1 if total <= CHECKED_WHOLE else -(-total // THINNED)
 
     def digest(view: int) -> int:
-        kept = pixels.kept(view)
+        kept = pixels.view_mask(view)
         found = hashlib.blake2b(pixels.view(view)[::step].contiguous().numpy().data, digest_size=8)
         if kept is not None:
             found.update(kept[::step].contiguous().numpy().data)

@@ -49,7 +49,7 @@ def photographed(scene: Scene, view: int, pinholes: Cameras) -> View:
 
     Viewers draw splats through pinholes. Pixels outside the photograph or its mask do not count.
     """
-    rgba, kept = scene.pixels.view(view), scene.pixels.kept(view)
+    rgba, kept = scene.pixels.view(view), scene.pixels.view_mask(view)
     camera = Pinhole.of(pinholes, view, float(scene.near[view]))
     height, width = camera.height, camera.width
     if scene.cameras.lens_model == "pinhole" and rgba.shape[:2] == (height, width):

@@ -87,7 +87,7 @@ def baselines(scene: Scene, views: list[int], background: Background, count: int
     nearest = NearestViews(scene, background, count)
     found: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for view in views:
-        truth, kept = photograph(scene, view, background), scene.pixels.kept(view)
+        truth, kept = photograph(scene, view, background), scene.pixels.view_mask(view)
         for kind, picture in nearest.pictures(view).items():
             psnr = image_metrics(picture, truth, kept)["psnr"]
             assert psnr is not None

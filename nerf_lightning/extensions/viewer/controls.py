@@ -16,7 +16,7 @@ from nerf_lightning.extensions.viewer.training_switch import TrainingPanel, Trai
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.world_frame import points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
-from nerf_lightning.video.paths.recorded_path import RecordedPath, new_file, told
+from nerf_lightning.video.paths.recorded_path import RecordedPath, error_message, new_file
 from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
@@ -114,7 +114,7 @@ class Controls:
             with new_file(self.folder, "snapshot", ".png") as path:
                 save_png(path, picture)
         except OSError as error:  # no click ends a training
-            self.session.client.add_notification("Snapshot", told(error), color="red")
+            self.session.client.add_notification("Snapshot", error_message(error), color="red")
         else:
             self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
 

@@ -12,7 +12,7 @@ from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.extensions.viewer.frusta import Frusta
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import as_code
-from nerf_lightning.video.paths.recorded_path import USUAL_SECONDS, RecordedPath, keyframe_of, told
+from nerf_lightning.video.paths.recorded_path import USUAL_SECONDS, RecordedPath, error_message, keyframe_of
 
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600.0
 PLAY, STOP = "Play", "Stop"
@@ -63,7 +63,7 @@ class PathPanel:
                 try:
                     act()
                 except (InputError, OSError) as error:
-                    self.said.content = as_code(told(error))
+                    self.said.content = as_code(error_message(error))
 
         return self.session.queue.errors.harmless(careful)
 

@@ -129,9 +129,9 @@ class HashGridEncoder(Encoder):
     def _blends(self) -> bool:
         return self._weights[-1] < 1.0
 
-    def _interpolate(self, points: Tensor, known: Tensor | None) -> Tensor:
+    def _interpolate(self, points: Tensor, cached: Tensor | None) -> Tensor:
         if not self._blends:
-            features = interpolate(self.table, points.reshape(-1, 3), self.layout, known)
+            features = interpolate(self.table, points.reshape(-1, 3), self.layout, cached)
         else:
             levels = sum(weight > 0.0 for weight in self._weights)
             features = interpolate(self.table, points.reshape(-1, 3), self.layout.coarsest(levels))

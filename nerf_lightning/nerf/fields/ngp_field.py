@@ -211,12 +211,12 @@ class NGPField(Field):
         out = mlp(features.flatten(0, -2), list(weights), self.matmul_precision)
         return out.view(*features.shape[:-1], out.shape[-1])
 
-    def _encoded(self, points: Points, known: Tensor | None) -> Tensor:
+    def _encoded(self, points: Points, cached: Tensor | None) -> Tensor:
         encoder, unit = self.position_encoder, self._unit(points.positions)
         if isinstance(encoder, ConeEncoder) and encoder.sees_cones and points.covariance is not None:
             covariance = self._unit_covariance(points.covariance, points.positions)
-            return encoder(unit, covariance) if known is None else encoder.attach_gradients(unit, known, covariance)
-        return encoder(unit) if known is None else encoder.attach_gradients(unit, known)
+            return encoder(unit, covariance) if cached is None else encoder.attach_gradients(unit, cached, covariance)
+        return encoder(unit) if cached is None else encoder.attach_gradients(unit, cached)
 
     def _unit(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():

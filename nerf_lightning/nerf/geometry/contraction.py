@@ -24,7 +24,7 @@ class Contracted(nn.Module):
         self.fixed = fixed
         self.register_buffer("switch", torch.tensor(bool(fixed)))
         # Reading the buffer stalls a GPU, so it is read once.
-        self._known: bool | None = bool(fixed)
+        self._cached: bool | None = bool(fixed)
 
     def fit_to(self, scene: Scene) -> None:
         """Set the switch as the scene says."""
@@ -34,13 +34,13 @@ class Contracted(nn.Module):
 
     def forget(self) -> None:
         """Read the buffer again, since it was written to."""
-        self._known = None
+        self._cached = None
 
     def is_on(self) -> bool:
         """Return whether space is contracted."""
-        if self._known is None:
-            self._known = bool(self.switch)
-        return self._known
+        if self._cached is None:
+            self._cached = bool(self.switch)
+        return self._cached
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)

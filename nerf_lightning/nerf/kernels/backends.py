@@ -89,7 +89,7 @@ def _is_kept(module: ModuleType) -> bool:
 
 def keeps_kernels() -> bool:
     """Return whether other processes find in numba's cache what this one compiles."""
-    return not _kept
+    return not _temporary_caches
 
 
 def _with_cache(module: str) -> ModuleType:
@@ -145,29 +145,30 @@ def _stamp_with_sources(module: ModuleType) -> None:
     numba itself compares a cached kernel only with the kernel's own file, and loads it whatever its bytes are.
     """
     for kernel in _compiled(module):
-        kept, digest = getattr(kernel._cache, "_cache_file", None), _digest(kernel.py_func.__module__)
-        if kept is not None and digest not in str(kept._source_stamp):
-            kept._source_stamp = f"{kept._source_stamp!r} {digest}"
-            kept._save_data, kept._load_data = partial(_save_checked, kept), partial(_load_checked, kept)
+        cache_file, digest = getattr(kernel._cache, "_cache_file", None), _digest(kernel.py_func.__module__)
+        if cache_file is not None and digest not in str(cache_file._source_stamp):
+            cache_file._source_stamp = f"{cache_file._source_stamp!r} {digest}"
+            cache_file._save_data = partial(_save_checked, cache_file)
+            cache_file._load_data = partial(_load_checked, cache_file)
 
 
-def _save_checked(kept: Any, name: str, kernel: object) -> None:
+def _save_checked(cache_file: Any, name: str, kernel: object) -> None:
     """Write a compiled kernel to numba's cache, followed by its checksum."""
-    content = kept._dump(kernel)
-    with kept._open_for_write(kept._data_path(name)) as file:
+    content = cache_file._dump(kernel)
+    with cache_file._open_for_write(cache_file._data_path(name)) as file:
         file.write(content + hashlib.sha256(content).digest())
 
 
-def _load_checked(kept: Any, name: str) -> Any:
+def _load_checked(cache_file: Any, name: str) -> Any:
     """Load a compiled kernel.
 
     Raises:
         OSError: it is damaged; numba then compiles it again.
     """
-    content = Path(kept._data_path(name)).read_bytes()
+    content = Path(cache_file._data_path(name)).read_bytes()
     if hashlib.sha256(content[:-DIGEST_BYTES]).digest() != content[-DIGEST_BYTES:]:
         raise OSError("damaged")
-    return type(kept)._load_data(kept, name)  # unpickling ends where the checksum begins
+    return type(cache_file)._load_data(cache_file, name)  # unpickling ends where the checksum begins
 
 
 @functools.cache
@@ -213,12 +214,12 @@ def _cache_elsewhere(reason: str) -> None:
     import numba
 
     folder = tempfile.TemporaryDirectory(prefix="nerf-numba-")
-    _kept.append(folder)
+    _temporary_caches.append(folder)
     numba.config.CACHE_DIR = folder.name  # type: ignore[attr-defined]
     log.warning("Until then every start compiles the kernels anew, which takes about a minute: %s", reason)
 
 
-_kept: list[tempfile.TemporaryDirectory[str]] = []
+_temporary_caches: list[tempfile.TemporaryDirectory[str]] = []
 """Folders that are removed when the process ends."""
 
 

@@ -25,16 +25,16 @@ PARTS_PER_THREAD = 4
 """More parts than threads, since some take longer than others."""
 
 
-class _Kept(threading.local):
+class _Local(threading.local):
     threads: int | None = None
 
 
-_kept = _Kept()
+_local = _Local()
 
 
 def num_threads() -> int:
     """Return the number of threads that share work: as many as torch has, or had before `torch_on_one_thread`."""
-    return torch.get_num_threads() if _kept.threads is None else _kept.threads
+    return torch.get_num_threads() if _local.threads is None else _local.threads
 
 
 @contextmanager
@@ -47,14 +47,14 @@ def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
     Args:
         shares_out: whether `in_parallel` still uses several threads.
     """
-    former, threads = _kept.threads, torch.get_num_threads()
-    _kept.threads = num_threads() if shares_out else 1
+    former, threads = _local.threads, torch.get_num_threads()
+    _local.threads = num_threads() if shares_out else 1
     if threads > 1:
         torch.set_num_threads(1)
     try:
         yield
     finally:
-        _kept.threads = former
+        _local.threads = former
         if threads > 1:
             torch.set_num_threads(threads)
 

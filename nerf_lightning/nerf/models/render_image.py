@@ -164,7 +164,7 @@ def render_rays(model: Model, rays: RayBundle, background: Background, tile_poin
 
 
 def _in_tiles(
-    model: Model, count: int, tile_points: int, render: Callable[[slice], Picture], together: int = 1
+    model: Model, count: int, tile_points: int, render: Callable[[slice], Picture], group_size: int = 1
 ) -> Picture:
     """Return what `render` sees of `count` rays, tile by tile, with ever smaller tiles if memory runs out.
 
@@ -178,16 +178,16 @@ def _in_tiles(
         at_once = min(at_once, model.most_rays)
     while True:
         try:
-            return _fill(model, count, at_once, render, together)
+            return _fill(model, count, at_once, render, group_size)
         except RuntimeError as error:
-            if at_once <= together or not is_out_of_memory(error):
+            if at_once <= group_size or not is_out_of_memory(error):
                 raise
         forget_workspaces()
         model.most_rays = at_once = at_once // 2
         log.warning("out of memory: rendering %d rays at a time from now on", at_once)
 
 
-def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture], together: int) -> Picture:
+def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture], group_size: int) -> Picture:
     # Allocated once: thousands of small results among temporaries would fragment memory to many times their size.
     first_rgb = None if model.first_picture is None else torch.empty(count, 3)
     picture, making = Picture(torch.empty(count, 3), torch.empty(count), torch.empty(count), first_rgb), Lock()
@@ -206,7 +206,7 @@ def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Pict
     threads = threads_on(next(model.parameters()).device)
     if threads > 1:  # share small pictures among threads, too
         at_once = min(at_once, max(FEWEST_ROWS, -(-count // (PARTS_PER_THREAD * threads))))
-    parts = list(tiles(count, at_once, together, multiple=threads))
+    parts = list(tiles(count, at_once, group_size, multiple=threads))
     if threads > 1:
         in_parallel(fill, parts)
     else:

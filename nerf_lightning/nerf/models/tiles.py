@@ -13,29 +13,29 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 from nerf_lightning.nerf.types.scene import Background
 
 
-def tiles(num_rays: int, tile_rays: int, together: int = 1, multiple: int = 1) -> Iterator[slice]:
+def tiles(num_rays: int, tile_rays: int, group_size: int = 1, multiple: int = 1) -> Iterator[slice]:
     """Return the slices that cut a batch into tiles of at most `tile_rays`, as equal in size as possible.
 
     Args:
         num_rays: number of rays of the batch.
         tile_rays: maximum number of rays per tile.
-        together: this many consecutive rays are never separated; the minimum number per tile.
+        group_size: this many consecutive rays are never separated; the minimum number per tile.
         multiple: the number of tiles is a multiple of this, if there are enough rays, so that threads have equal
             numbers.
 
     >>> [(part.start, part.stop) for part in tiles(10, 4)]
     [(0, 4), (4, 7), (7, 10)]
-    >>> [(part.start, part.stop) for part in tiles(12, 7, together=4)]
+    >>> [(part.start, part.stop) for part in tiles(12, 7, group_size=4)]
     [(0, 4), (4, 8), (8, 12)]
     """
-    groups = -(-num_rays // together)
-    count = max(1, -(-groups // max(1, tile_rays // together)))
+    groups = -(-num_rays // group_size)
+    count = max(1, -(-groups // max(1, tile_rays // group_size)))
     count = max(1, min(groups, -(-count // multiple) * multiple))
     size, rest = divmod(groups, count)
     start = 0
     for number in range(count):
         stop = start + size + int(number < rest)
-        yield slice(start * together, min(stop * together, num_rays))
+        yield slice(start * group_size, min(stop * group_size, num_rays))
         start = stop
 
 

@@ -16,27 +16,27 @@ LEAST_FAR = 5e-3
 """Smaller motions are never far: radians, or shares of the scene's extent."""
 
 
-def align_untrained_cameras(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
+def align_untrained_cameras(initial: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
     """Return the cameras as learned, with those that were not trained on moved by the trained ones' overall motion.
 
     The photographs do not determine the scene's position, size and rotation, so all trained cameras may have drifted
     together: the others follow by the similarity between the trained ones before and after.
     """
     rows = list(trained)
-    c2w = carried(given.c2w, similarity_between(given.c2w[rows], learnt.c2w[rows]))
+    c2w = carried(initial.c2w, similarity_between(initial.c2w[rows], learnt.c2w[rows]))
     c2w[rows] = learnt.c2w[rows]
     return replace(learnt, c2w=c2w)
 
 
 def camera_displacements(
-    given: Cameras, learnt: Cameras, trained: Sequence[int], extent: float
+    initial: Cameras, learnt: Cameras, trained: Sequence[int], extent: float
 ) -> Float[Tensor, "trained"]:
     """Return how far each trained camera has moved, apart from the motion of all.
 
     This is its rotation angle (radians) plus its shift divided by the scene's extent.
     """
     rows = list(trained)
-    before = carried(given.c2w[rows], similarity_between(given.c2w[rows], learnt.c2w[rows])).double()
+    before = carried(initial.c2w[rows], similarity_between(initial.c2w[rows], learnt.c2w[rows])).double()
     after = learnt.c2w[rows].double()
     # |R - R'|_F = 2 sqrt(2) sin(angle / 2), which is exact for small angles where the arc cosine is not.
     chord = (before[:, :, :3] - after[:, :, :3]).flatten(1).norm(dim=1)

@@ -104,12 +104,12 @@ def _visible_colors(field: Field, rays: RayBundle, samples: RaggedSamples) -> Fi
     seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
     output = field(points[seen], features[seen])
 
-    def of_all(values: Tensor) -> Tensor:
+    def scatter(values: Tensor) -> Tensor:
         return values.new_zeros(density.shape[0], values.shape[1]).index_copy_(0, seen, values)
 
     rgb = density.new_zeros(density.shape[0], 3)
     rgb[seen] = output.rgb
-    return FieldOutput(density, rgb, channels={name: of_all(values) for name, values in output.channels.items()})
+    return FieldOutput(density, rgb, channels={name: scatter(values) for name, values in output.channels.items()})
 
 
 def _samples_per_chunk(rays: int, rays_left: int) -> int:

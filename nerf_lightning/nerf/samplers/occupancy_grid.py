@@ -113,7 +113,7 @@ class OccupancyGrid(Part):
         half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) / self.resolution
         return torch.stack(torch.meshgrid(*axes, indexing="ij")).view(3, -1).t(), half_diagonal
 
-    def _from_cells(self, at: Tensor) -> Tensor:
+    def _from_cells(self, coordinates: Tensor) -> Tensor:
         """Return positions that are given in cells from the lower corner of the box."""
         center, half = center_and_half(self.aabb)
-        return center + (2.0 * at / self.resolution - 1.0) * half
+        return center + (2.0 * coordinates / self.resolution - 1.0) * half

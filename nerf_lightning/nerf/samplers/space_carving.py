@@ -55,7 +55,7 @@ def possible_cells(
 
 def _matter(scene: Scene, view: int) -> Bool[Tensor, "height width"]:
     matter = scene.pixels.view(view)[..., 3] > 0
-    kept = scene.pixels.kept(view)
+    kept = scene.pixels.view_mask(view)
     matter = matter if kept is None else matter | ~kept  # masked pixels may be anything
     return _grown(matter, round(WRONG_BY * float(scene.cameras.focal[view].mean()))) if scene.refined else matter
 

@@ -9,12 +9,12 @@ WHOLE_BLOCKS = 256
 """Larger batches are multiples of this: Triton recompiles kernels for sizes that are not multiples of 16."""
 
 
-def batch_sizes(largest: int, together: int = 1) -> list[int]:
+def batch_sizes(largest: int, multiple_of: int = 1) -> list[int]:
     """Return the possible batch sizes, the largest first: each about 0.84 times the one before.
 
     Args:
-        largest: the largest size, a multiple of `together`.
-        together: all sizes are multiples of it.
+        largest: the largest size.
+        multiple_of: all sizes are multiples of this, `largest` included.
 
     >>> batch_sizes(4096)[:9], batch_sizes(4096)[-1]
     ([4096, 3328, 2816, 2304, 2048, 1536, 1280, 1024, 768], 32)
@@ -23,17 +23,17 @@ def batch_sizes(largest: int, together: int = 1) -> list[int]:
     for number in range(1, SIZES_PER_HALVING * HALVINGS + 1):
         size = int(largest * 2.0 ** (-number / SIZES_PER_HALVING))
         size -= size % WHOLE_BLOCKS if size > WHOLE_BLOCKS else 0
-        sizes.add(max(size - size % together, together))
+        sizes.add(max(size - size % multiple_of, multiple_of))
     return sorted(sizes, reverse=True)
 
 
-def batch_size(largest: int, wanted: float, together: int = 1) -> int:
+def batch_size(largest: int, wanted: float, multiple_of: int = 1) -> int:
     """Return the largest of `batch_sizes` that is at most `wanted`; the smallest if all are larger.
 
-    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, together=256)
+    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, multiple_of=256)
     (1280, 4096, 32, 256)
     """
-    sizes = batch_sizes(largest, together)
+    sizes = batch_sizes(largest, multiple_of)
     return next((size for size in sizes if size <= wanted), sizes[-1])
 
 

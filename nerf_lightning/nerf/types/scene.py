@@ -152,7 +152,7 @@ class PixelStore:
         """Return one view as a picture (no copy)."""
         return self._picture(self.rgba, index)
 
-    def kept(self, index: int) -> Bool[Tensor, "height width"] | None:
+    def view_mask(self, index: int) -> Bool[Tensor, "height width"] | None:
         """Return which pixels of one view the mask keeps; None without a mask."""
         return None if self.mask is None else self._picture(self.mask, index) > 0
 

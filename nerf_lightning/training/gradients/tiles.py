@@ -120,7 +120,7 @@ class TileGradients:
             seen = objective(batch[tile], None if random is None else random[tile], weight_scale)
             return seen.scaled((tile.stop - tile.start) / share.num_rays)
 
-        together, threads = objective.together, 1 if self.points is None else threads_on(device)
+        together, threads = objective.pixels_per_patch, 1 if self.points is None else threads_on(device)
         learns_cameras = objective.rays.learns_cameras
         if threads > 1 and not objective.model.takes_whole_rays(device, training=True, learns_cameras=learns_cameras):
             parts = list(tiles(batch.num_rays, num_pixels, together, multiple=threads))
@@ -146,7 +146,7 @@ class TileGradients:
         return pixels_in_tile(self.objective.model, self.points, training=True)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
-        if self.points is None or self._pixels_in_tile(batch) <= self.objective.together:
+        if self.points is None or self._pixels_in_tile(batch) <= self.objective.pixels_per_patch:
             cures = ["fewer rays (data.batch_rays)", "a smaller model", "tiles (trainer.tile_points=auto)"]
             possible = cures[:2] if self.takes_whole_batches else cures
             raise InputError(

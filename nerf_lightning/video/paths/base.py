@@ -61,19 +61,19 @@ class PathFrame:
         return unit_of(self.to_user)
 
     def point(
-        self, name: str, given: Sequence[int | float] | None, otherwise: Float[Tensor, "3"] | None = None
+        self, name: str, value: Sequence[int | float] | None, otherwise: Float[Tensor, "3"] | None = None
     ) -> Float[Tensor, "3"]:
         """Return a point that the user gave as setting `name`, in scene coordinates; None: another (the center)."""
-        if given is None:
+        if value is None:
             return self.center if otherwise is None else otherwise
-        check_setting(name, given, is_point(given), "three finite numbers, [x, y, z], in the capture's own frame")
-        point = torch.tensor([[float(number) for number in given]], dtype=torch.float64)
+        check_setting(name, value, is_point(value), "three finite numbers, [x, y, z], in the capture's own frame")
+        point = torch.tensor([[float(number) for number in value]], dtype=torch.float64)
         return points_from_user(point, self.to_user.double())[0].to(self.center)
 
     @disable_autocast
-    def direction(self, given: Sequence[float]) -> Float[Tensor, "3"]:
+    def direction(self, vector: Sequence[float]) -> Float[Tensor, "3"]:
         """Return a direction that the user gave as a unit vector of the scene."""
-        user = torch.tensor([float(number) for number in given], dtype=torch.float64)
+        user = torch.tensor([float(number) for number in vector], dtype=torch.float64)
         return normalize(self.to_user[:3, :3].double().mT @ user, dim=0).to(self.center)
 
     def size(self, width: int | None, height: int | None) -> tuple[int, int, float]:
@@ -89,18 +89,18 @@ class PathFrame:
         return width, (max(1, round(self.height * scale)) if height is None else height), scale
 
 
-def is_point(given: object) -> bool:
+def is_point(value: object) -> bool:
     """Return whether a value is three finite numbers.
 
     >>> is_point([0, 1.5, -2]), is_point([0, 1]), is_point("top")
     (True, False, False)
     """
-    return isinstance(given, (list, tuple)) and len(given) == 3 and all(map(is_number, given))
+    return isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value))
 
 
-def is_number(given: object) -> bool:
+def is_number(value: object) -> bool:
     """Return whether a value is a number that a path can have: finite, and not astronomical."""
-    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) < LARGEST
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < LARGEST
 
 
 def check_setting(name: str, value: object, good: bool, rule: str) -> None:

@@ -43,17 +43,17 @@ class KeyframeCurve:
         logs = [[math.log(keyframe_focal(each, around))] for each in keyframes]
         self._log_focal = torch.tensor(logs, dtype=self.knots.dtype)
 
-    def poses(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames 3 4"]:
+    def poses(self, times: Float[Tensor, "frames"]) -> Float[Tensor, "frames 3 4"]:
         """Return the camera-to-world poses at some times."""
-        c2w = poses_along(self.knots, self._keys, at)
+        c2w = poses_along(self.knots, self._keys, times)
         eyes = c2w[:, :, 3]
-        back = normalize(eyes - along(self.knots, self._targets, at), dim=-1)
+        back = normalize(eyes - along(self.knots, self._targets, times), dim=-1)
         right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
         return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
 
-    def focal(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
+    def focal(self, times: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
         """Return the focal lengths at some times (pixels, at the photographs' width), geometric between keyframes."""
-        focal = along(self.knots, self._log_focal, at).exp()[:, 0].float()
+        focal = along(self.knots, self._log_focal, times).exp()[:, 0].float()
         if not bool(((focal > 0) & torch.isfinite(focal)).all()):
             raise InputError(
                 "path.file: the curve through the keyframes' fields of view swings beyond all cameras. Give times that "
@@ -127,12 +127,14 @@ class KeyframePath(CameraPath):
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras between the keyframes."""
         curve = KeyframeCurve(self.keyframes, around, self.times, self.closed)
-        at = frame_times(curve.knots, self._count(), self.closed)
-        cameras = self.pinholes(curve.poses(at).to(around.center), around)
+        times = frame_times(curve.knots, self._count(), self.closed)
+        cameras = self.pinholes(curve.poses(times).to(around.center), around)
         if self.fov is not None:
             return cameras
         scale = cameras.width[0] / around.width
-        return replace(cameras, focal=(scale * curve.focal(at)[:, None]).expand(-1, 2).to(cameras.focal).contiguous())
+        return replace(
+            cameras, focal=(scale * curve.focal(times)[:, None]).expand(-1, 2).to(cameras.focal).contiguous()
+        )
 
     @property
     def seconds(self) -> float:

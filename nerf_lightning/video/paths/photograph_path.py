@@ -36,8 +36,8 @@ class PhotographPath(CameraPath):
             raise InputError(f"{named}, and a path needs two. Name more; for a camera that stays, name one twice.")
         keys = around.poses[numbers]
         knots = even_speed(keys, around.radius, self.closed)
-        at = frame_times(knots, self.num_frames, self.closed)
-        return self.pinholes(poses_along(knots, keys, at), around)
+        times = frame_times(knots, self.num_frames, self.closed)
+        return self.pinholes(poses_along(knots, keys, times), around)
 
 
 def find_views(chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:

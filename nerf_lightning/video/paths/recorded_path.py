@@ -133,7 +133,7 @@ def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
         raise
 
 
-def told(error: Exception) -> str:
+def error_message(error: Exception) -> str:
     """Return the message for a request that failed, or a file that could not be written."""
     if not isinstance(error, OSError):
         return str(error)

@@ -18,7 +18,7 @@ SHORTEST_LEG = 1e-2  # The shortest leg as a share of the mean one: coinciding k
 
 
 def hermite(
-    knots: Float[Tensor, "keys"], values: Float[Tensor, "keys channels"], at: Float[Tensor, "frames"]
+    knots: Float[Tensor, "keys"], values: Float[Tensor, "keys channels"], times: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames channels"]:
     """Return the curve through `values`, which it passes at `knots` (increasing, two or more), at other times.
 
@@ -29,9 +29,9 @@ def hermite(
     slope = values.diff(dim=0) / length
     inner = (length[:-1] * slope[1:] + length[1:] * slope[:-1]) / (length[:-1] + length[1:])
     tangent = torch.cat([slope[:1], inner, slope[-1:]])
-    leg = (torch.searchsorted(knots, at, right=True) - 1).clamp(0, len(knots) - 2)
+    leg = (torch.searchsorted(knots, times, right=True) - 1).clamp(0, len(knots) - 2)
     h = length[leg]
-    s = (at - knots[leg])[:, None] / h
+    s = (times - knots[leg])[:, None] / h
     return (
         (1 + 2 * s) * (1 - s).square() * values[leg]
         + s * (1 - s).square() * h * tangent[leg]
@@ -61,10 +61,10 @@ def frame_times(knots: Float[Tensor, "knots"], num_frames: int, closed: bool) ->
 
 
 def along(
-    knots: Float[Tensor, "knots"], values: Float[Tensor, "keys channels"], at: Float[Tensor, "frames"]
+    knots: Float[Tensor, "knots"], values: Float[Tensor, "keys channels"], times: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames channels"]:
-    """Return the curve at times `at`; with one more knot than values it is closed, and smooth where it closes."""
-    return hermite(*_continued(knots, values), at)
+    """Return the curve at `times`; with one more knot than values it is closed, and smooth where it closes."""
+    return hermite(*_continued(knots, values), times)
 
 
 def _continued(knots: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,7 +78,7 @@ def _continued(knots: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
 
 @disable_autocast
 def rotations_along(
-    knots: Float[Tensor, "knots"], rotations: Float[Tensor, "keys 3 3"], at: Float[Tensor, "frames"]
+    knots: Float[Tensor, "knots"], rotations: Float[Tensor, "keys 3 3"], times: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames 3 3"]:
     """Return rotations between those of the keys, each leg the shorter way around."""
     knots, quaternions = _continued(knots, quaternion_from_rotation(rotations))
@@ -86,12 +86,12 @@ def rotations_along(
     turned = [quaternions[0]]
     for _, following in pairwise(quaternions):
         turned.append(following if turned[-1] @ following >= 0 else -following)
-    return rotation_from_quaternion(normalize(hermite(knots, torch.stack(turned), at), dim=-1))
+    return rotation_from_quaternion(normalize(hermite(knots, torch.stack(turned), times), dim=-1))
 
 
 def poses_along(
-    knots: Float[Tensor, "knots"], poses: Float[Tensor, "keys 3 4"], at: Float[Tensor, "frames"]
+    knots: Float[Tensor, "knots"], poses: Float[Tensor, "keys 3 4"], times: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames 3 4"]:
     """Return poses between those of the keys."""
-    places = along(knots, poses[:, :, 3], at)
-    return torch.cat([rotations_along(knots, poses[:, :, :3], at), places[:, :, None]], dim=-1)
+    places = along(knots, poses[:, :, 3], times)
+    return torch.cat([rotations_along(knots, poses[:, :, :3], times), places[:, :, None]], dim=-1)

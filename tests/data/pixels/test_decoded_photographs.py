@@ -72,7 +72,7 @@ def test_mapped_values_are_those_of_decoding(capture, cache, downscale):
             rgba = area_downscale(crop_to_multiple(read_rgba(photograph.path), downscale), downscale)
             assert np.array_equal(store.view(view).numpy(), rgba)
         assert store.mask is None
-        assert store.kept(0) is None
+        assert store.view_mask(0) is None
         assert store.has_transparency
 
 
@@ -218,8 +218,8 @@ def test_masks_are_read_with_the_pictures(capture, cache, tmp_path):
     masked = [Photograph(capture[0].path, write_mask(tmp_path / "m.png", kept)), *capture[1:]]
     for _ in range(2):
         store = read(masked, cache)
-        assert np.array_equal(store.kept(0).numpy(), kept)
-        assert store.kept(1).all()
+        assert np.array_equal(store.view_mask(0).numpy(), kept)
+        assert store.view_mask(1).all()
         assert store.mask.numel() == len(store.rgba)
         assert np.array_equal(store.view(0).numpy(), read_rgba(capture[0].path))
     assert read(capture, cache).mask is None

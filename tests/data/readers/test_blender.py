@@ -136,7 +136,7 @@ def test_masks_count_and_a_size_that_is_no_multiple_is_cropped(root):
         Image.fromarray(np.uint8([[0] * 8] * 3 + [[255] * 8] * 5)).save(mask)
     pixels = BlenderReader(str(root), downscale=3).read().pixels
     assert (pixels.width.tolist(), pixels.height.tolist()) == ([2] * 14, [2] * 14)
-    assert pixels.kept(0).tolist() == [[0, 0], [1, 1]]
+    assert pixels.view_mask(0).tolist() == [[0, 0], [1, 1]]
     assert BlenderReader(str(root), masks="none").read().pixels.mask is None
 
 

@@ -346,7 +346,7 @@ def test_the_cameras_size_tells_how_a_photograph_lies(tmp_path, plain, caplog, o
         Image.fromarray(np.ascontiguousarray(np.rot90(mask, quarter))).save(root / "masks" / f"p_{view}.png")
     scene = read(root, masks="masks")
     assert_plain(scene, plain)
-    assert torch.equal(scene.pixels.kept(4), torch.from_numpy(mask == 255))
+    assert torch.equal(scene.pixels.view_mask(4), torch.from_numpy(mask == 255))
     if orientation in (3, 6, 8):
         said_once(caplog, rf"{9 if quarter else 0}, whose sizes match their cameras only then")
 

@@ -159,9 +159,9 @@ def test_masks_may_keep_black(tmp_path):
     for _ in range(2):  # once from the cache
         scene = read("transforms", root, masks="masks", masks_keep="black")
         for view in range(9):
-            assert not bool(scene.pixels.kept(view)[view].any())
-            assert int(scene.pixels.kept(view).sum()) == 11 * 16
-    assert int(read("transforms", root, masks="masks").pixels.kept(0).sum()) == 16
+            assert not bool(scene.pixels.view_mask(view)[view].any())
+            assert int(scene.pixels.view_mask(view).sum()) == 11 * 16
+    assert int(read("transforms", root, masks="masks").pixels.view_mask(0).sum()) == 16
 
 
 def test_three_photographs_with_poses_make_a_scene(tmp_path):
@@ -190,11 +190,11 @@ def test_a_frames_own_mask_and_a_folder_that_overrules_it(tmp_path):
     frames[1]["mask_path"] = f"own\\images\\{known.names[1]}"
     write_json(tmp_path, intrinsics_of(known) | {"frames": frames})
     scene = read("transforms", tmp_path)
-    assert bool(scene.pixels.kept(0).all())
-    assert not bool(scene.pixels.kept(1)[:, 0].any())
+    assert bool(scene.pixels.view_mask(0).all())
+    assert not bool(scene.pixels.view_mask(1)[:, 0].any())
     scene = read("transforms", tmp_path, masks="other")
-    assert not bool(scene.pixels.kept(1)[:, 5].any())
-    assert bool(scene.pixels.kept(1)[:, 0].all())
+    assert not bool(scene.pixels.view_mask(1)[:, 5].any())
+    assert bool(scene.pixels.view_mask(1)[:, 0].all())
 
 
 def test_the_frames_filter(tmp_path):

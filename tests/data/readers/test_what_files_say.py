@@ -173,7 +173,7 @@ def test_only_the_circle_of_a_fisheye_counts(root, size):
     factor = size[0] / 16
     top(root, fisheye_crop_radius=4.0 * factor, w=size[0], h=size[1], camera_model="OPENCV_FISHEYE")
     top(root, **{key: value * factor for key, value in {"fl_x": 20, "fl_y": 20, "cx": 8, "cy": 6}.items()})
-    kept = read(root).pixels.kept(0)
+    kept = read(root).pixels.view_mask(0)
     y, x = np.mgrid[:12, :16] + 0.5
     np.testing.assert_array_equal(kept.bool().numpy(), (x - 8) ** 2 + (y - 6) ** 2 <= 16)
 
@@ -194,7 +194,7 @@ CUT_OUT = np.concatenate([photograph(1, 16, 12), HALF[..., None]], axis=-1)
 def test_masks_of_two_values_cut_outs_and_other_sizes_are_understood(root, mask):
     save(root / "masks/0.png", mask)
     each_frame(root, mask_path="masks/0.png")
-    np.testing.assert_array_equal(read(root).pixels.kept(2).bool().numpy(), HALF > 0)
+    np.testing.assert_array_equal(read(root).pixels.view_mask(2).bool().numpy(), HALF > 0)
 
 
 def test_ones_everywhere_are_white(tmp_path):
@@ -206,7 +206,7 @@ def test_ones_everywhere_are_white(tmp_path):
 def test_an_odd_radius_keeps_all_or_leaves_the_views_out_in_words(root, radius):
     top(root, fisheye_crop_radius=radius, camera_model="OPENCV_FISHEYE")
     if radius == 1e308:
-        assert bool(read(root).pixels.kept(0).all())
+        assert bool(read(root).pixels.view_mask(0).all())
     else:
         with pytest.raises(InputError, match=r"fisheye_crop_radius .*9 of the 9 views"):
             read(root)
@@ -226,7 +226,7 @@ def test_names_of_masks_may_differ_in_zeros_case_and_ending(root, name):
         save(root / "m" / name.format(view), np.roll(HALF, view, axis=1))
     scene = read(root, masks="m")
     for view in ALL:
-        np.testing.assert_array_equal(scene.pixels.kept(view).bool().numpy(), np.roll(HALF, view, axis=1) > 0)
+        np.testing.assert_array_equal(scene.pixels.view_mask(view).bool().numpy(), np.roll(HALF, view, axis=1) > 0)
 
 
 @pytest.mark.parametrize(
@@ -272,8 +272,8 @@ def test_a_folder_called_masks_that_holds_something_else_costs_nothing(root, cap
 def test_instant_ngps_dynamic_masks_leave_out_what_is_white(root):
     save(root / "images/dynamic_mask_p_3.png", HALF)
     pixels = read(root).pixels
-    np.testing.assert_array_equal(pixels.kept(3).bool().numpy(), HALF == 0)
-    assert bool(pixels.kept(2).all())
+    np.testing.assert_array_equal(pixels.view_mask(3).bool().numpy(), HALF == 0)
+    assert bool(pixels.view_mask(2).all())
 
 
 def exchanged():

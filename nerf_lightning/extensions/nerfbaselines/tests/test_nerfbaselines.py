@@ -113,7 +113,7 @@ def test_rays_are_those_of_nerfbaselines(dataset):
 def test_a_data_set_is_learnt_from_as_it_is(dataset):
     scene = scene_of(dataset)
     assert scene.splits == {"train": tuple(range(6)), "val": (), "test": ()}
-    np.testing.assert_array_equal(scene.pixels.kept(3).numpy(), dataset["masks"][3])
+    np.testing.assert_array_equal(scene.pixels.view_mask(3).numpy(), dataset["masks"][3])
     poses = torch.from_numpy(dataset["cameras"].poses)
     assert torch.allclose(scene.user_cameras.c2w[:, :, 3], poses[:, :, 3].double(), atol=1e-5)
 

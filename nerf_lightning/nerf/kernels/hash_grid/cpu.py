@@ -54,17 +54,17 @@ def add_table_gradient(
 
 
 def add_table_gradients(
-    into: Float[Tensor, "entries features"], found: Sequence[tuple[Tensor, Tensor]], layout: HashGridLayout
+    into: Float[Tensor, "entries features"], contributions: Sequence[tuple[Tensor, Tensor]], layout: HashGridLayout
 ) -> None:
     """Add several gradients with respect to the table, one after another.
 
     Args:
         into: the sum, of the table's size.
-        found: sets of points, `points 3`, each with the gradient of their features, `points out`.
+        contributions: sets of points, `points 3`, each with the gradient of their features, `points out`.
         layout: where the levels' entries are.
     """
     table, of_layout = into.numpy(), (*level_arrays(layout), (0,) * into.shape[1])
-    arrays = [(points.numpy(), grad.numpy()) for points, grad in found]
+    arrays = [(points.numpy(), grad.numpy()) for points, grad in contributions]
 
     def add(level: int) -> None:
         for points, grad in arrays:

@@ -26,7 +26,7 @@ def interpolate(
     table: Float[Tensor, "entries features"],
     points: Float[Tensor, "points 3"],
     layout: HashGridLayout,
-    known: Float[Tensor, "points out"] | None = None,
+    cached: Float[Tensor, "points out"] | None = None,
     used: Int[Tensor, "1"] | None = None,
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level; points outside are clamped to it.
@@ -37,14 +37,14 @@ def interpolate(
         table: all levels' entries.
         points: in the unit cube.
         layout: where the levels' entries are.
-        known: what this function returned for the same arguments without gradients, to avoid recomputing it.
+        cached: what this function returned for the same arguments without gradients, to avoid recomputing it.
         used: on CUDA, the index from which all points are padding: kernels skip it, and it has no gradients.
     """
     backend = cpu_backend("hash_grid.cpu", points.device) or cuda_backend("hash_grid.cuda", points.device)
     if backend is None or table.dtype == torch.float64:
         return interpolate_torch(table, points, layout)
     padding = (used,) if used is not None and points.is_cuda else ()
-    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, known, padding)
+    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, cached, padding)
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def add_all(held: Sequence[TableGradient], scale: float = 1.0) -> None:
         if table.grad is None:
             table.grad = torch.zeros_like(table)
         alike = [each for each in held if each.table is table and each.layout == layout]
-        found = [(each.points, each.grad if scale == 1.0 else each.grad * scale) for each in alike]
-        same.kernels.add_table_gradients(table.grad, found, layout)
+        contributions = [(each.points, each.grad if scale == 1.0 else each.grad * scale) for each in alike]
+        same.kernels.add_table_gradients(table.grad, contributions, layout)
 
 
 def table_gradient(
@@ -121,12 +121,12 @@ _held = _Held()
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, known: Any, padding: Any
+        ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, cached: Any, padding: Any
     ) -> Tensor:
         ctx.save_for_backward(table, points)
         ctx.layout, ctx.backend, ctx.padding = layout, backend, padding
-        if known is not None:
-            return known.view_as(known)
+        if cached is not None:
+            return cached.view_as(cached)
         return backend.forward(table.detach(), points.detach(), layout, *padding)
 
     @staticmethod

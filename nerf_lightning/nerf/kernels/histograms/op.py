@@ -17,9 +17,9 @@ class RayLoss(torch.autograd.Function):
     """Apply it to the function that computes, the weights that have a gradient, and the loss's other inputs."""
 
     @staticmethod
-    def forward(ctx: Any, compute: Callable[..., None], weights: Tensor, *given: Tensor) -> Float[Tensor, "rays"]:
-        """Call `compute(weights, *given, out, grad)`, which writes the last two."""
-        arrays = [each.detach().contiguous() for each in (weights, *given)]
+    def forward(ctx: Any, compute: Callable[..., None], weights: Tensor, *inputs: Tensor) -> Float[Tensor, "rays"]:
+        """Call `compute(weights, *inputs, out, grad)`, which writes the last two."""
+        arrays = [each.detach().contiguous() for each in (weights, *inputs)]
         out, grad = weights.new_empty(len(weights)), torch.empty_like(arrays[0])
         if out.numel():
             compute(*arrays, out, grad)

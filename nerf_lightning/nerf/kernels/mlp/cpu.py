@@ -77,23 +77,23 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     packed, dims = packed_words(weights, widths, transposed=False), np.array(widths)
     padded = -(-rows // ROWS) * ROWS
     out = points.new_empty(padded, weights[-1].shape[0])
-    kept = torch.empty(padded if keep else 0, words_of(sum(widths[:-1]), weights[0].dtype), dtype=torch.int32)
-    arrays = points.numpy(), packed, dims, out.numpy(), kept.numpy()
+    saved = torch.empty(padded if keep else 0, words_of(sum(widths[:-1]), weights[0].dtype), dtype=torch.int32)
+    arrays = points.numpy(), packed, dims, out.numpy(), saved.numpy()
     in_parallel(lambda part: _forward(kind, part.start, part.stop, keep, *arrays), tiles_of_rows(rows))
-    return out[:rows], kept
+    return out[:rows], saved
 
 
 def backward(
-    grad: Tensor, weights: Sequence[Tensor], kept: Tensor, wants_points: bool
+    grad: Tensor, weights: Sequence[Tensor], saved: Tensor, wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:
-    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
+    """Return the gradients of the inputs and of the weights; `saved` is what `forward` returned."""
     widths, kind = padded_widths(weights), KINDS[weights[0].dtype]
     packed, dims = packed_words(weights, widths, transposed=True), np.array(widths)
     rows = grad.shape[0]
-    grad_points = torch.empty(kept.shape[0] if wants_points else 0, weights[0].shape[1])
+    grad_points = torch.empty(saved.shape[0] if wants_points else 0, weights[0].shape[1])
     tiles = tiles_of_rows(rows)
     sums = torch.zeros(len(tiles), sum(a * b for a, b in pairwise(widths)))
-    arrays = grad.float().contiguous().numpy(), packed, dims, kept.numpy(), grad_points.numpy()
+    arrays = grad.float().contiguous().numpy(), packed, dims, saved.numpy(), grad_points.numpy()
 
     def tile(number: int) -> None:
         part = tiles[number]
@@ -336,7 +336,7 @@ def back_through(kind, x, w, dims, dy, y, upper, lower, total, wants_inputs, int
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _forward(kind, first, last, keep, points, packed, dims, out, kept):
+def _forward(kind, first, last, keep, points, packed, dims, out, saved):
     layers, words = len(dims) - 1, dims[:-1].sum() * bytes_of(kind) // 4
     stride, whole = 4 * words, out.shape[1] == dims[layers]
     own = np.zeros((1 if keep else ROWS, words), np.int32)
@@ -344,9 +344,9 @@ def _forward(kind, first, last, keep, points, packed, dims, out, kept):
     flat = sums.reshape(-1)
     for start in range(first, last, ROWS):
         count = min(ROWS, last - start)
-        x = address(kept) + start * stride if keep else address(own)
+        x = address(saved) + start * stride if keep else address(own)
         if keep and count < ROWS:
-            kept[start : start + ROWS] = 0  # the backward pass sums over whole blocks
+            saved[start : start + ROWS] = 0  # the backward pass sums over whole blocks
         round_rows(
             kind, address(points) + 4 * start * dims[0], 4 * dims[0], x, bytes_of(kind) * dims[0], count, dims[0]
         )
@@ -374,7 +374,7 @@ def _round_gradient(kind, grad, start, count, width, flat, target):
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _backward(kind, first, last, wants_points, grad, packed, dims, kept, grad_points, grads):
+def _backward(kind, first, last, wants_points, grad, packed, dims, saved, grad_points, grads):
     layers, size, widest = len(dims) - 1, bytes_of(kind), dims.max()
     stride = size * dims[:-1].sum()
     sums, room = np.empty((ROWS, widest), np.float32), np.empty((3, ROWS, widest * size // 4), np.int32)
@@ -382,7 +382,7 @@ def _backward(kind, first, last, wants_points, grad, packed, dims, kept, grad_po
     for start in range(first, last, ROWS):
         y, dy = address(sums), address(room)
         _round_gradient(kind, grad, start, min(ROWS, last - start), dims[layers], flat, dy)
-        x, into = address(kept) + start * stride, address(grad_points) + 4 * start * dims[0]
+        x, into = address(saved) + start * stride, address(grad_points) + 4 * start * dims[0]
         back_through(
             kind, x, address(packed), dims, dy, y, dy + next_room, dy + 2 * next_room, address(grads),
             wants_points, into,

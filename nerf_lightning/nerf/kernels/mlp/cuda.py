@@ -46,8 +46,8 @@ def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
         return False
     try:
         weights = [torch.zeros(outer, inner, device=device) for inner, outer in pairwise(sizes)]
-        out, kept = forward(torch.zeros(BLOCK, sizes[0], device=device), weights, keep=True)
-        backward(out, weights, kept, wants_points=True)
+        out, saved = forward(torch.zeros(BLOCK, sizes[0], device=device), weights, keep=True)
+        backward(out, weights, saved, wants_points=True)
     except OutOfResources as error:
         log.warning(
             "%s has %d bytes of %s and the fused kernel for layers of widths %s needs %d: torch computes these layers "
@@ -64,26 +64,26 @@ def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
 
 def forward(
     points: Float[Tensor, "points in"], weights: Sequence[Tensor], keep: bool, used: Int[Tensor, "1"] | None = None
-) -> tuple[Float[Tensor, "points out"], BFloat16[Tensor, "kept words"]]:
+) -> tuple[Float[Tensor, "points out"], BFloat16[Tensor, "saved words"]]:
     """Return the outputs, and the inputs of all layers if they are kept; zeros from row `used` on.
 
     Rounded up to a block: a program whose rows are all padding computes nothing.
     """
     widths, rows = _padded_widths(weights), points.shape[0]
     out = torch.empty(rows, weights[-1].shape[0], device=points.device)
-    kept = out.new_empty(rows if keep else 0, sum(widths[:-1]), dtype=torch.bfloat16)
+    saved = out.new_empty(rows if keep else 0, sum(widths[:-1]), dtype=torch.bfloat16)
     if rows:
-        arrays = points.contiguous(), *_three(weights), out, kept, used
+        arrays = points.contiguous(), *_three(weights), out, saved, used
         flags = len(weights), keep, BLOCK, INTERPRETED
         _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *_sizes(weights, widths), *flags, **FORWARD)
-    return out, kept
+    return out, saved
 
 
 def backward(
-    grad: Float[Tensor, "points out"], weights: Sequence[Tensor], kept: BFloat16[Tensor, "points words"],
+    grad: Float[Tensor, "points out"], weights: Sequence[Tensor], saved: BFloat16[Tensor, "points words"],
     wants_points: bool, used: Int[Tensor, "1"] | None = None,
 ) -> tuple[Float[Tensor, "points in"] | None, list[Tensor]]:  # fmt: skip
-    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned for the same `used`."""
+    """Return the gradients of the inputs and of the weights; `saved` is what `forward` returned for the same `used`."""
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
     programs = max(1, min(PROGRAMS * _multiprocessors(grad.device), triton.cdiv(rows, BACKWARD_BLOCK)))
@@ -91,7 +91,7 @@ def backward(
     if not rows:
         sums.zero_()
     else:
-        arrays = grad.contiguous(), *_three(weights), kept, of_points, sums, used
+        arrays = grad.contiguous(), *_three(weights), saved, of_points, sums, used
         flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
         _backward[(programs,)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)
     total, grads, offset = sums.sum(dim=0), [], 0
@@ -111,8 +111,8 @@ def trial(device: str = "cuda") -> None:
     for hidden in range(1, max(LAYERS)):
         points, count = torch.ones(3, 16, device=device), 16.0**hidden
         weights = [torch.ones(16, 16, device=device) for _ in range(hidden)] + [torch.ones(3, 16, device=device)]
-        out, kept = forward(points, weights, keep=True)
-        of_points, of_weights = backward(torch.ones_like(out), weights, kept, wants_points=True)
+        out, saved = forward(points, weights, keep=True)
+        of_points, of_weights = backward(torch.ones_like(out), weights, saved, wants_points=True)
         expected = torch.full_like(out, 16.0 * count), torch.full_like(points, 3.0 * count)
         if not (torch.equal(out, expected[0]) and of_points is not None and torch.equal(of_points, expected[1])):
             raise RuntimeError("a trial of its kernels gave wrong numbers")
@@ -171,8 +171,8 @@ def _rows(array, row, count, width: tl.constexpr, padded: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _kept_at(kept, row, words: tl.constexpr, first: tl.constexpr, width: tl.constexpr):
-    return kept + row[:, None] * words + first + tl.arange(0, width)[None, :]
+def _saved_at(saved, row, words: tl.constexpr, first: tl.constexpr, width: tl.constexpr):
+    return saved + row[:, None] * words + first + tl.arange(0, width)[None, :]
 
 
 @triton.jit
@@ -187,7 +187,7 @@ def _activated(
 @triton.jit
 @no_type_check
 def _forward(
-    points, w0, w1, w2, out, kept, used, count,
+    points, w0, w1, w2, out, saved, used, count,
     n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
     d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
     layers: tl.constexpr, keep: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
@@ -204,12 +204,12 @@ def _forward(
     x = _rows(points, row, count, n0, d0)
     y = _activated(x, w0, n0, n1, d0, d1, widen)
     if keep:
-        tl.store(_kept_at(kept, row, words, 0, d0), x, mask=valid)
-        tl.store(_kept_at(kept, row, words, d0, d1), y, mask=valid)
+        tl.store(_saved_at(saved, row, words, 0, d0), x, mask=valid)
+        tl.store(_saved_at(saved, row, words, d0, d1), y, mask=valid)
     if layers == 3:
         z = _activated(y, w1, n1, n2, d1, d2, widen)
         if keep:
-            tl.store(_kept_at(kept, row, words, d0 + d1, d2), z, mask=valid)
+            tl.store(_saved_at(saved, row, words, d0 + d1, d2), z, mask=valid)
         sums = _multiply(z, tl.trans(_weights(w2, n2, n3, d2, d3)), widen)
         column = tl.arange(0, d3)
     else:
@@ -238,7 +238,7 @@ def _store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer:
 @triton.jit
 @no_type_check
 def _backward(
-    grad, w0, w1, w2, kept, of_points, sums, used, count,
+    grad, w0, w1, w2, saved, of_points, sums, used, count,
     n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, n3: tl.constexpr,
     d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, d3: tl.constexpr,
     layers: tl.constexpr, wants_points: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
@@ -252,15 +252,15 @@ def _backward(
         valid = (row < count)[:, None]
         if layers == 3:
             flowing = _rows(grad, row, count, n3, d3)
-            z = tl.load(_kept_at(kept, row, words, d0 + d1, d2), mask=valid, other=0.0)
+            z = tl.load(_saved_at(saved, row, words, d0 + d1, d2), mask=valid, other=0.0)
             of_2 += _multiply(tl.trans(flowing), z, widen)
             flowing = _passed_back(flowing, z, w2, n2, n3, d2, d3, widen)
         else:
             flowing = _rows(grad, row, count, n3, d2)
-        y = tl.load(_kept_at(kept, row, words, d0, d1), mask=valid, other=0.0)
+        y = tl.load(_saved_at(saved, row, words, d0, d1), mask=valid, other=0.0)
         of_1 += _multiply(tl.trans(flowing), y, widen)
         flowing = _passed_back(flowing, y, w1, n1, n2, d1, d2, widen)
-        x = tl.load(_kept_at(kept, row, words, 0, d0), mask=valid, other=0.0)
+        x = tl.load(_saved_at(saved, row, words, 0, d0), mask=valid, other=0.0)
         of_0 += _multiply(tl.trans(flowing), x, widen)
         if wants_points:
             column = tl.arange(0, d0)

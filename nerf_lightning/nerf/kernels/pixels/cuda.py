@@ -20,14 +20,14 @@ BLOCK = 64
 
 
 def batch(
-    rays: Order, domain: Domain, store: PixelStore, known: KnownDepths | None = None, of_known: Order = NOWHERE
+    rays: Order, domain: Domain, store: PixelStore, depths: KnownDepths | None = None, of_known: Order = NOWHERE
 ) -> Batch:
     """Return the batch (`op.ordered_batch`)."""
     device, several = store.rgba.device, len(rays.places)
     count = several + len(of_known.places)
     view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
     rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
-    distance, certainty = (None, None) if known is None else (torch.empty_like(weight), torch.empty_like(weight))
+    distance, certainty = (None, None) if depths is None else (torch.empty_like(weight), torch.empty_like(weight))
     if count:
         _batch[(triton.cdiv(count, BLOCK),)](
             *(view, x, y, rgba, weight, distance, certainty),
@@ -35,7 +35,7 @@ def batch(
             *(count, of_known.places.start, of_known.size, of_known.key, *grid_of(of_known.size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
             *(store.offset, store.width, store.rgba, store.mask),
-            *([None] * 5 if known is None else known.tensors()),
+            *([None] * 5 if depths is None else depths.tensors()),
             FEISTEL_ROUNDS,
             BLOCK,
         )
@@ -51,8 +51,8 @@ def trial(device: str = "cuda") -> None:
     ends, views = torch.tensor([[4, 8], [0, 1]], device=device)  # two pictures of 2 x 2
     domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
     store = PixelStore(rgba.view(8, 4).to(torch.uint8), ends - 4, 0 * views + 2, 0 * views + 2, has_transparency=True)
-    known = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
-    found = batch(Order(range(8), 8, 1), domain, store, known, Order(range(2), 2, 1))
+    depths = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
+    found = batch(Order(range(8), 8, 1), domain, store, depths, Order(range(2), 2, 1))
     number = 4 * found.pixels.view + 2 * found.pixels.y + found.pixels.x
     right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
     if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):

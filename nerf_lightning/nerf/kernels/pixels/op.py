@@ -45,7 +45,7 @@ def has_kernel(device: torch.device) -> bool:
 
 
 def ordered_batch(
-    rays: Order, domain: Domain, store: PixelStore, known: KnownDepths | None = None, of_known: Order = NOWHERE
+    rays: Order, domain: Domain, store: PixelStore, depths: KnownDepths | None = None, of_known: Order = NOWHERE
 ) -> Batch:
     """Return pixels at some places in the order of a domain, then some of those of known distance.
 
@@ -55,9 +55,9 @@ def ordered_batch(
         rays: places in the domain.
         domain: the numbered pixels.
         store: all pixels.
-        known: pixels whose distance is known; None: no distances are needed.
+        depths: pixels whose distance is known; None: no distances are needed.
         of_known: places among them.
     """
     kernels = cuda_backend("pixels.cuda", domain.ends.device)
     assert kernels is not None, "has_kernel is asked first"
-    return kernels.batch(rays, domain, store, known, of_known)
+    return kernels.batch(rays, domain, store, depths, of_known)

@@ -258,15 +258,15 @@ def _num_visible(density, starts, ends, bounds, counts, opaque_below, block: tl.
 @triton.jit
 @no_type_check
 def _first(
-    starts, ends, bounds, found, ends_of_rays, features, to_index, to_starts, to_ends, to_bounds, to_found, to_features,
-    rays, capacity, width: tl.constexpr, columns: tl.constexpr, block: tl.constexpr,
+    starts, ends, bounds, num_found, ends_of_rays, features, to_index, to_starts, to_ends, to_bounds, to_found,
+    to_features, rays, capacity, width: tl.constexpr, columns: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     ray, lane, column = tl.program_id(0).to(tl.int64), tl.arange(0, block), tl.arange(0, columns)[None, :]
     total = tl.load(ends_of_rays + rays - 1, mask=rays > 0, other=0)
     used = tl.minimum(total, capacity)
     if ray == 0:
         tl.store(to_bounds + rays, used)
-        tl.store(to_found, total + tl.load(found) - tl.load(bounds + rays))
+        tl.store(to_found, total + tl.load(num_found) - tl.load(bounds + rays))
     if ray < rays:
         begin = tl.load(ends_of_rays + ray - 1, mask=ray > 0, other=0)
         first, last = tl.minimum(begin, capacity), tl.minimum(tl.load(ends_of_rays + ray), capacity)

@@ -119,7 +119,7 @@ class _Call:
         self.kind, self.edges = KINDS[self.dtype], self.edges.detach().float().contiguous()
         self.rays, self.samples = len(self.edges), self.edges.shape[1] - 1
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
-        self.kept: list[tuple[Workspace, int]] = []  # workspace of each part, with its number of samples
+        self.saved: list[tuple[Workspace, int]] = []  # workspace of each part, with its number of samples
         # To the unit cube, or to the cube inscribed in the unit ball (`geometry.contraction`).
         low, high = self.field.aabb
         side, shift = high - low, 0.0
@@ -164,7 +164,7 @@ class _Call:
             return workspace, _forward(self.kind, *bounds, *given, workspace.arrays(), shown)
 
         if self.keep:
-            self.kept = in_parallel(keep, self.parts)
+            self.saved = in_parallel(keep, self.parts)
         else:
             in_parallel(lambda bounds: _show(self.kind, *bounds, *given, shown), self.parts)
         return out
@@ -181,13 +181,13 @@ class _Call:
             weights: weights of both MLPs.
             grads: gradients of what `forward` returned.
         """
-        if not self.kept:
+        if not self.saved:
             raise RuntimeError("This rendering has been sent back already, and keeps nothing for a second time.")
         density, color = self.split(weights)
         widths = padded_widths(density), padded_widths(color) if color else []
         counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
         sums = torch.zeros(len(self.parts), sum(counts))
-        found, ends = len(self.field.layout.resolutions) * table.shape[1], np.cumsum([used for _, used in self.kept])
+        found, ends = len(self.field.layout.resolutions) * table.shape[1], np.cumsum([used for _, used in self.saved])
         points, of_points = torch.empty(int(ends[-1]), 3), torch.empty(int(ends[-1]), found)
         of_rays = [torch.zeros(each.shape) for each in rays]
         space, grid, networks = self.space(*rays[:2]), self.grid(table), self.networks(weights, transposed=True)
@@ -196,7 +196,7 @@ class _Call:
 
         def part(number: int) -> None:
             totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
-            workspace, used = self.kept[number]
+            workspace, used = self.saved[number]
             given = space, grid, networks, numbers, of_light, workspace.arrays(), out, totals
             _backward(self.kind, *self.parts[number], ends[number] - used, used, *given)
 
@@ -204,8 +204,8 @@ class _Call:
         total = sums.sum(dim=0)
         of_weights = unpadded(total[: counts[0]], density, widths[0])
         of_weights += unpadded(total[counts[0] :], color, widths[1]) if color else []
-        give_back([workspace for workspace, _ in self.kept])
-        self.kept = []
+        give_back([workspace for workspace, _ in self.saved])
+        self.saved = []
         of_rays[0] *= self.scale
         of_rays[1] *= self.scale
         return of_rays, points, of_points, of_weights
@@ -213,11 +213,11 @@ class _Call:
 
 class _DenseRays(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, call: _Call, *given: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, call: _Call, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         ctx.call = call
         if call.keep:
-            ctx.save_for_backward(*given)
-        return call.forward(*given)
+            ctx.save_for_backward(*inputs)
+        return call.forward(*inputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -234,10 +234,10 @@ class _DenseRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _next_samples(first, last, samples, at, lights, block):
+def _next_samples(first, last, samples, cursor, lights, block):
     # Fill a block, and return how many samples it has, and where the next one begins. The rays that go forward together
     # contribute their first samples, then their second ones, and so on, as far as light gets through.
-    leftmost, k, c = at
+    leftmost, k, c = cursor
     count, width = 0, min(ABREAST, last - leftmost)
     while count < ROWS and leftmost < last:
         r = leftmost + c
@@ -254,7 +254,7 @@ def _next_samples(first, last, samples, at, lights, block):
 
 @njit(fastmath={"contract"}, error_model="numpy")
 @no_type_check
-def _place(space, count, block, points):
+def _locate(space, count, block, points):
     # Distance, length and position (in the unit cube) of a block's samples.
     origins, directions, edges, contracted = space
     owner, sample, t, delta, x, y, z = block
@@ -320,27 +320,27 @@ def _new_block():
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call, kept, out):
+def _forward(kind, first, last, space, of_rays, grid, networks, numbers_of_call, saved, out):
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
     bias, whole_from, opaque_below, closed, hidden = numbers_of_call
-    places, all_numbers, all_points, density_kept, color_kept = kept
+    places, all_numbers, all_points, density_kept, color_kept = saved
     weights, foreground = out
     samples, colored, size = space[2].shape[1] - 1, color_dims.shape[0] > 0, bytes_of(kind)
     block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32)
-    lights, at, start = np.ones(last - first, np.float32), (first, 0, 0), 0
+    lights, cursor, start = np.ones(last - first, np.float32), (first, 0, 0), 0
     flat, outer = sums.reshape(-1), dims[-1]
     stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
-    while at[0] < last:
-        count, at = _next_samples(first, last, samples, at, lights, block)
+    while cursor[0] < last:
+        count, cursor = _next_samples(first, last, samples, cursor, lights, block)
         if count == 0:
             break
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
         for i in range(count):
             places[start + i] = (block[0][i] - first) * samples + block[1][i]
-        _place(space, count, block, points)
+        _locate(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + start * stride, address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
@@ -390,12 +390,12 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
         np.zeros(ROWS * size * (color_dims[:-1].sum() if colored else 0) // 4, np.int32),
         np.zeros((ROWS, color_dims.max() if colored else 0), np.float32),
     )
-    least, at, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
-    while at[0] < last:
-        count, at = _next_samples(first, last, samples, at, lights, block)
+    least, cursor, waiting = min(LEAST_WEIGHT, opaque_below), (first, 0, 0), 0
+    while cursor[0] < last:
+        count, cursor = _next_samples(first, last, samples, cursor, lights, block)
         if count == 0:
             break
-        _place(space, count, block, points)
+        _locate(space, count, block, points)
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(words), address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
@@ -417,7 +417,7 @@ def _show(kind, first, last, space, of_rays, grid, networks, numbers_of_call, ou
 
 @njit
 @no_type_check
-def _composite_back(count, first, colored, least_slope, grads, block, numbers, behind, outer, flat, raw):
+def _composite_back(count, first, colored, least_slope, grads, block, numbers, suffix_sums, outer, flat, raw):
     # Gradients of a block's raw colors, contiguous in `flat`, and of its raw densities; from back to front.
     of_weights, of_light = grads
     flat[: ROWS * outer] = ZERO
@@ -432,8 +432,8 @@ def _composite_back(count, first, colored, least_slope, grads, block, numbers, b
             if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black or full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope * numbers[i, SHARE]
-        raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])
-        behind[r - first] += w * g
+        raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - suffix_sums[r - first])
+        suffix_sums[r - first] += w * g
 
 
 @njit
@@ -474,11 +474,11 @@ def _move_rays(count, contracted, block, toward, of_origins, of_directions):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _backward(kind, first, last, begin, used, space, grid, networks, numbers_of_call, grads, kept, out, totals):
+def _backward(kind, first, last, begin, used, space, grid, networks, numbers_of_call, grads, saved, out, totals):
     table, resolutions, offsets, hashed, mask, lanes = grid
     density_words, dims, color_words, color_dims = networks
     least_slope, hidden, wants_rays = numbers_of_call
-    places, all_numbers, all_points, density_kept, color_kept = kept
+    places, all_numbers, all_points, density_kept, color_kept = saved
     points_out, of_points, of_origins, of_directions, of_rays = out
     of_density, of_color = totals
     size, samples, colored = bytes_of(kind), space[2].shape[1] - 1, color_dims.shape[0] > 0
@@ -492,14 +492,14 @@ def _backward(kind, first, last, begin, used, space, grid, networks, numbers_of_
         np.zeros((ROWS, 3), np.float32),
     )
     block, flat, next_room, outer = _new_block(), sums.reshape(-1), size * ROWS * widest, dims[-1]
-    behind, width = np.zeros(last - first, np.float32), of_points.shape[1]
+    suffix_sums, width = np.zeros(last - first, np.float32), of_points.shape[1]
     for start in range((used - 1) // ROWS * ROWS, -1, -ROWS):
         count, row = min(ROWS, used - start), begin + start
         numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
         for i in range(count):
             block[0][i], block[1][i] = first + places[start + i] // samples, places[start + i] % samples
-        _place(space, count, block, points)
-        _composite_back(count, first, colored, least_slope, grads, block, numbers, behind, color_outer, flat, raw)
+        _locate(space, count, block, points)
+        _composite_back(count, first, colored, least_slope, grads, block, numbers, suffix_sums, color_outer, flat, raw)
         y, dy = address(sums), address(words)
         if colored:
             round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)

@@ -91,9 +91,9 @@ def render(
         dtype: dtype to which the factors of the MLPs' products are rounded: float32 or bfloat16.
         samples_per_ray: approximate number of samples per ray.
     """
-    given = _Given(rays, field, state, lattice, grid, opaque_below, dtype, samples_per_ray)
-    out = _WholeRays.apply(given, field.table, *field.density_weights, *field.color_weights)
-    return *out, given.asked
+    call = _Call(rays, field, state, lattice, grid, opaque_below, dtype, samples_per_ray)
+    out = _WholeRays.apply(call, field.table, *field.density_weights, *field.color_weights)
+    return *out, call.num_evaluated
 
 
 def trial() -> None:
@@ -104,7 +104,7 @@ def trial() -> None:
     (light.sum() + opacity.sum() + depth.sum()).backward()
 
 
-class _Given:
+class _Call:
     """All that a pass needs besides the tensors with gradients."""
 
     def __init__(
@@ -122,7 +122,7 @@ class _Given:
         self.march, self.world, self.directions = along(rays, field, state, lattice, grid)
         self.hidden = field.handed_over(self.directions.shape[1])
         self.limits = np.float32(field.bias), np.float32(opaque_below), self.hidden
-        self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
+        self.rays, self.samples_per_ray, self.num_evaluated = rays.near.shape[0], samples_per_ray, 0
         self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
         self.workspaces: list[Workspace] = []
         self.used: list[int] = []
@@ -141,16 +141,16 @@ class _Given:
             rows = SPARE_ROWS + ROWS * (int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS)
             while True:
                 workspace = take_workspace(rows, (of_density, of_color))
-                used, asked = _see(self.kind, *bounds, *given, workspace.arrays(), arrays_of(out))
+                used, evaluated = _see(self.kind, *bounds, *given, workspace.arrays(), arrays_of(out))
                 if used * ROWS <= workspace.rows:
-                    return workspace, used, asked
+                    return workspace, used, evaluated
                 rows = 2 * workspace.rows
                 for each in out:
                     each[bounds[0] : bounds[1]] = 0.0
 
         found = in_parallel(part, self.parts)
         self.workspaces, self.used = [workspace for workspace, _, _ in found], [used for _, used, _ in found]
-        self.asked = sum(asked for _, _, asked in found)
+        self.num_evaluated = sum(evaluated for _, _, evaluated in found)
 
     def go_back(
         self, density: list[Tensor], color: list[Tensor], grads: tuple[Tensor, ...]
@@ -183,11 +183,11 @@ class _Given:
 
 class _WholeRays(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, given: _Given, table: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        layers = len(given.field.density_weights)
-        out = torch.zeros(given.rays, 3), torch.zeros(given.rays), torch.zeros(given.rays)
-        given.see(table, list(weights[:layers]), list(weights[layers:]), out)
-        ctx.given, ctx.layers = given, layers
+    def forward(ctx: Any, call: _Call, table: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        layers = len(call.field.density_weights)
+        out = torch.zeros(call.rays, 3), torch.zeros(call.rays), torch.zeros(call.rays)
+        call.see(table, list(weights[:layers]), list(weights[layers:]), out)
+        ctx.call, ctx.layers = call, layers
         ctx.save_for_backward(table, *weights)
         return out
 
@@ -195,10 +195,10 @@ class _WholeRays(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
         table, *weights = ctx.saved_tensors
-        of_weights, points, features = ctx.given.go_back(weights[: ctx.layers], weights[ctx.layers :], grads)
+        of_weights, points, features = ctx.call.go_back(weights[: ctx.layers], weights[ctx.layers :], grads)
         of_table = None
         if ctx.needs_input_grad[1]:
-            of_table = table_gradient(table, points, features, ctx.given.field.layout, hash_grid)
+            of_table = table_gradient(table, points, features, ctx.call.field.layout, hash_grid)
         return None, of_table, *of_weights
 
 
@@ -272,13 +272,13 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     flat = sums.reshape(-1)
     size = bytes_of(kind)
     stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
-    live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
+    live, waiting, block, evaluated, end = 0, first, 0, 0, march[5].shape[0] - 2
     while True:
         live, waiting = start(march, SLOTS, live, waiting, last, ray, sample_index, light)
         if live == 0:
-            return block, asked
+            return block, evaluated
         if (block + 1) * ROWS > all_owners.shape[0]:
-            return block + 1, asked
+            return block + 1, evaluated
         rows = slice(block * ROWS, (block + 1) * ROWS)
         owners, numbers, points = all_owners[rows], all_numbers[rows], all_points[rows]
         count = _take(march, world, live, ray, sample_index, slots, owners, lengths, distances, points)
@@ -288,7 +288,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
         round_rows(kind, address(features), 4 * dims[0], x, size * dims[0], ROWS, dims[0])
         through(kind, x, address(density_words), dims, y, y)
         absorb(count, flat, dims[-1], bias, False, ZERO, lengths, distances, points, numbers, rooms)
-        asked += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
+        evaluated += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
         for i in range(count):
             fill(inputs, i, hidden, flat, i * dims[-1], directions, ray[slots[i]])
         x = address(color_kept) + block * ROWS * color_stride
@@ -301,7 +301,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
 
 @njit
 @no_type_check
-def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
+def _composite_back(owners, numbers, first, least_slope, grads, suffix_sums, outer, flat, of_density):
     # Gradients of a block's raw colors, contiguous in `flat`, and of its raw densities; from back to front.
     of_light, of_opacity, of_depth = grads
     flat[: ROWS * outer] = ZERO
@@ -319,8 +319,8 @@ def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, f
             if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black or full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope
-        of_density[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])
-        behind[r - first] += w * g
+        of_density[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - suffix_sums[r - first])
+        suffix_sums[r - first] += w * g
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -332,11 +332,11 @@ def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, f
     stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
     sums, words = np.zeros((ROWS, widest), np.float32), np.zeros((3, ROWS, widest * size // 4), np.int32)
     passed, raw = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.float32)
-    behind = np.zeros(bounds[1] - bounds[0], np.float32)
+    suffix_sums = np.zeros(bounds[1] - bounds[0], np.float32)
     flat, next_room, outer, color_outer = sums.reshape(-1), size * ROWS * widest, dims[-1], color_dims[-1]
     for block in range(blocks - 1, -1, -1):
         rows = slice(block * ROWS, (block + 1) * ROWS)
-        _composite_back(owners[rows], numbers[rows], bounds[0], least_slope, grads, behind, color_outer, flat, raw)
+        _composite_back(owners[rows], numbers[rows], bounds[0], least_slope, grads, suffix_sums, color_outer, flat, raw)
         y, dy = address(sums), address(words)
         round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
         back_through(
