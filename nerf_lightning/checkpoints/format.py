@@ -12,7 +12,7 @@ from nerf_lightning import __version__
 from nerf_lightning.checkpoints.quantization import Quantized
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import check_cameras, check_scene
-from nerf_lightning.files.trust import Mismatch, require_fit, shown
+from nerf_lightning.files.trust import Mismatch, for_message, require_fit
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.progress import Progress
@@ -78,10 +78,10 @@ def require_our_format(content: Mapping[str, Any], path: Path) -> None:
             f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
             "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
         )
-    written, version = record.get("format"), shown(record.get("version")).strip("'")
+    written, version = record.get("format"), for_message(record.get("version")).strip("'")
     if type(written) is not int or written != FORMAT:
         raise InputError(
-            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
+            f"{path} has checkpoint format {for_message(written)} (written by nerf_lightning {version}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )
 

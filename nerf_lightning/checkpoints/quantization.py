@@ -80,11 +80,11 @@ def dequantized(quantized: Mapping[str, Any], where: str) -> dict[str, Tensor]:
     }
 
 
-def _table(table: QuantizedRows, place: str) -> Tensor:
+def _table(table: QuantizedRows, name: str) -> Tensor:
     width = table.shape[1] if len(table.shape) == 2 else 1
     count = math.prod(table.shape) // max(1, width)
     if table.values.shape[1:] != (width,) or table.means.shape != (len(table.starts), width):
-        raise Mismatch(place, f"has rows of {tuple(table.values.shape)} in a table of {table.shape}")
+        raise Mismatch(name, f"has rows of {tuple(table.values.shape)} in a table of {table.shape}")
     kept = torch.ones(count, dtype=torch.bool) if table.kept is None else from_bits(table.kept, count)
     block = block_of(table.starts, count)
     rows = table.means[block]

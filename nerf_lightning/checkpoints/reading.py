@@ -124,7 +124,7 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
         return _newest_of_run(path)
     content = read_content(path)
     if to_resume:
-        _Kept.content = _identity(path), content
+        _ResumeCache.content = _identity(path), content
     return checkpoint_of(content, path)
 
 
@@ -167,7 +167,7 @@ def read_content(path: Path) -> dict[str, Any]:
     return content
 
 
-class _Kept:
+class _ResumeCache:
     content: tuple[tuple[int, ...], dict[str, Any]] | None = None
 
 
@@ -182,7 +182,7 @@ def content_to_resume(path: Path) -> dict[str, Any]:
     Raises:
         InputError: as `read_checkpoint`.
     """
-    kept, _Kept.content = _Kept.content, None
+    kept, _ResumeCache.content = _ResumeCache.content, None
     return kept[1] if kept is not None and path.is_file() and kept[0] == _identity(path) else read_content(path)
 
 

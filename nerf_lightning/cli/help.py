@@ -27,7 +27,7 @@ def help_on(name: str, arguments: list[str]) -> str:
     words = [word for word in arguments[asked + 1 :] if not word.startswith("-")]
     if not words:
         return command_page(_command(name), _width())
-    return "\n\n".join(_found(word, [name]) for word in words)
+    return "\n\n".join(_page_for(word, [name]) for word in words)
 
 
 def help_on_anything(words: list[str], commands: list[str]) -> str:
@@ -42,7 +42,7 @@ def help_on_anything(words: list[str], commands: list[str]) -> str:
         known = (word for word in words if search([word], searched, _width()))
         fewer = next((f"Use fewer, such as nerf help {word}." for word in known), "nerf --help lists the commands.")
         raise InputError(f"Nothing in the help has all these words: {' '.join(words)}. {fewer}")
-    return found or "\n\n".join(page or _found(word, order) for word, page in zip(words, pages, strict=True))
+    return found or "\n\n".join(page or _page_for(word, order) for word, page in zip(words, pages, strict=True))
 
 
 def _in_every_command(word: str, commands: list[str]) -> str:
@@ -54,7 +54,7 @@ def _in_every_command(word: str, commands: list[str]) -> str:
     return "\n\n".join(f"nerf {name}: {page}" for page, name in told.items())
 
 
-def _found(word: str, names: list[str]) -> str:
+def _page_for(word: str, names: list[str]) -> str:
     for name in names:
         page = page_of(_command(name), word, _width())
         if page is not None:

@@ -97,11 +97,11 @@ def compose_once() -> None:
     if not IS_1_3 or composed.__module__ == __name__:
         return
 
-    def get_mode(hydra: Hydra, *given: Any, **named: Any) -> Any:
+    def get_mode(hydra: Hydra, *args: Any, **kwargs: Any) -> Any:
         may_set_a_mode = any(
             word.startswith(OTHER_FILES) or word.lstrip("+~").startswith(MAY_SET_A_MODE) for word in sys.argv[1:]
         )
-        return composed(hydra, *given, **named) if may_set_a_mode else None
+        return composed(hydra, *args, **kwargs) if may_set_a_mode else None
 
     Hydra.get_mode = get_mode  # type: ignore[assignment, method-assign]
 

@@ -57,14 +57,14 @@ def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
     return opened.checkpoint.scene
 
 
-def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
+def labels_of(checkpoints: list[Checkpoint], labels: Any) -> list[str]:
     """Return labels for checkpoints shown side by side: as given, or else from their run folders."""
-    if given is None:
+    if labels is None:
         paths = [checkpoint.path.absolute() for checkpoint in checkpoints]
         names = [path.parents[1].name if path.parent.name == "checkpoints" else path.stem for path in paths]
         twice = len(set(names)) < len(names)
         return [f"{name} {each.path.stem}" if twice else name for name, each in zip(names, checkpoints, strict=True)]
-    labels = list(map(str, as_list(given)))
+    labels = list(map(str, as_list(labels)))
     if len(labels) != len(checkpoints):
         raise InputError(f"labels={labels}: give one for each of the {len(checkpoints)} checkpoints, or null.")
     return labels

@@ -59,11 +59,11 @@ def run(config: DictConfig) -> None:
         raise SystemExit(1)
 
 
-def _print(rows: list[Row], device: str, known: dict[str, Any], seconds: float) -> None:
+def _print(rows: list[Row], device: str, machine_info: dict[str, Any], seconds: float) -> None:
     StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {device}"))
     counts = ", ".join(f"{sum(row.outcome == each for row in rows)} {each}" for each in ("ok", "wrong", "not run"))
     say(*remarks(rows), f"{counts}; {spoken(seconds)}")
-    say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in known.items()))
+    say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in machine_info.items()))
 
 
 def _rows(settings: TrainerSettings) -> list[Row]:

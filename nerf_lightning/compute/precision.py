@@ -18,7 +18,7 @@ Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
 NATIVE = "native bfloat16"
 
 
-def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen, str]:
+def choose_precision(requested: Precision, device_type: DeviceType) -> tuple[Chosen, str]:
     """Return the precision and the reason; auto is bf16-mixed if the device computes it natively.
 
     The environment variable NERF_LIGHTNING_PRECISION overrides what auto means, to try one kind of machine as another.
@@ -27,7 +27,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
         InputError: tf32 was requested on a device without it, or the environment names no known precision.
     """
     meant = os.environ.get("NERF_LIGHTNING_PRECISION", "auto")
-    if asked == "auto" and meant != "auto":
+    if requested == "auto" and meant != "auto":
         if meant not in get_args(Precision):
             raise InputError(
                 f"NERF_LIGHTNING_PRECISION={meant} in the environment is not a precision: use one "
@@ -35,7 +35,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
             )
         precision, reason = cast(Precision, meant), "as NERF_LIGHTNING_PRECISION says"
     else:
-        precision, reason = asked, "as asked"
+        precision, reason = requested, "as asked"
     if precision == "auto":
         return ("bf16-mixed", NATIVE) if has_native_bfloat16(device_type) else ("32-true", "no native bfloat16")
     if precision == "tf32" and not has_tf32(device_type):
@@ -43,9 +43,9 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
             "trainer.precision=tf32: TensorFloat-32 needs an NVIDIA GPU of the Ampere generation (2020) or later, "
             "which this device is not. Use trainer.precision=32-true, or auto."
         )
-    if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
+    if requested == "bf16-mixed" and not has_native_bfloat16(device_type):
         instead = "float32 is used instead" if device_type == "cuda" else "it is emulated, slowly"
-        log.warning("trainer.precision=%s: this device has no native bfloat16, so %s.", asked, instead)
+        log.warning("trainer.precision=%s: this device has no native bfloat16, so %s.", requested, instead)
     return precision, reason
 
 

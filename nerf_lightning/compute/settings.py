@@ -99,10 +99,10 @@ class ComputeSettings:
         processes = f"{ranks.world_size()} processes, each " if ranks.world_size() > 1 else ""
         return f"{processes}{self.device_type}{threads} ({self.device_reason}), {self.precision} ({self.reason})"
 
-    def keep_precision(self, former: Any) -> None:
+    def keep_precision(self, previous: Any) -> None:
         """Keep the precision that a run began with, unless one was requested: it decides the weights' last bits."""
         if self.reason != "as asked":
-            self._chosen = self.precision, self.reason = former, "as when the run started"
+            self._chosen = self.precision, self.reason = previous, "as when the run started"
 
 
 def cluster_environment() -> ClusterEnvironment:

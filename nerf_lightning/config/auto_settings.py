@@ -52,7 +52,7 @@ STEPS_SETTING = "model.levels.fine.sampler.num_steps"
 RAYS_SETTING = "model.subpixels"
 GRID_SETTINGS = {"encoder", "encoder.max_resolution", "encoder.log2_table_size"}
 """Settings that choose the grid if the user types one of them."""
-SETTLED = (
+CHOSEN_NUMBERS = (
     *("encoder.max_resolution", "encoder.log2_table_size", "field.color_layers"),
     *(STEPS_SETTING, RAYS_SETTING, "data.batch_rays", "data.sample_budget"),
 )
@@ -73,22 +73,22 @@ GPU_BATCHES = {
 log = logging.getLogger(__name__)
 
 
-def with_longest(asked: Composed, on_gpu: bool) -> Composed:
+def with_longest(requested: Composed, on_gpu: bool) -> Composed:
     """Return the config with the size of photographs that a GPU has time for, unless the user has typed one."""
-    begun = None if asked.former is None else _number(asked.former, LONGEST_SETTING)
-    if "longest" not in asked.config.scene or LONGEST_SETTING in asked.typed or not (begun or on_gpu):
-        return asked
-    return asked.with_setting(LONGEST_SETTING, int(begun or GPU_LONGEST))
+    begun = None if requested.resumed is None else _number(requested.resumed, LONGEST_SETTING)
+    if "longest" not in requested.config.scene or LONGEST_SETTING in requested.typed or not (begun or on_gpu):
+        return requested
+    return requested.with_setting(LONGEST_SETTING, int(begun or GPU_LONGEST))
 
 
-def takes_distances(asked: Composed, scene: Scene) -> bool:
+def takes_distances(requested: Composed, scene: Scene) -> bool:
     """Return whether a run learns from known distances: with loss=depth, which model=auto chooses for photographs."""
-    if "loss" in asked.typed or asked.choices.get("model") != AUTO:
-        return asked.choices.get("loss") == "depth"
+    if "loss" in requested.typed or requested.choices.get("model") != AUTO:
+        return requested.choices.get("loss") == "depth"
     return model_for(scene)[0] == PHOTOGRAPHS
 
 
-def resolve_auto(asked: Composed, scene: Scene, device_type: str = "cpu") -> Composed:
+def resolve_auto(requested: Composed, scene: Scene, device_type: str = "cpu") -> Composed:
     """Return the config with every choice made for its scene.
 
     A resumed run keeps what was chosen for it, on any device and for any length.
@@ -99,21 +99,21 @@ def resolve_auto(asked: Composed, scene: Scene, device_type: str = "cpu") -> Com
     Raises:
         InputError: a setting that is neither a value nor auto.
     """
-    config, former = asked.config, asked.former
+    config, resumed = requested.config, requested.resumed
     is_capture = config.scene.get("root", "") != "" and scene.capture_of is None  # of an archive it is empty
     seconds = config.budget.seconds
     if seconds == AUTO:
         has_steps = config.trainer.max_steps is not None or config.trainer.max_epochs is not None
         seconds = CPU_SECONDS if device_type == "cpu" and not has_steps else None
-        if former is not None and not has_steps:
-            seconds = _number(former, "budget.seconds")
-    fitted = fit_model(asked, scene, device_type == "cuda", seconds)
+        if resumed is not None and not has_steps:
+            seconds = _number(resumed, "budget.seconds")
+    fitted = fit_model(requested, scene, device_type == "cuda", seconds)
     config = copy.deepcopy(fitted.config)
     _settle(config, "doctor", is_capture)
     _settle(config.final, "report", is_capture)
     writes_page = is_capture and _writes_page(fitted, seconds)
     if writes_page:
-        if config.budget.seconds == AUTO and former is None:
+        if config.budget.seconds == AUTO and resumed is None:
             seconds = CPU_SECONDS - PAGE_SECONDS
         log.info("page: after %g s of training, export/page.html is written (final.page=false skips it)", seconds)
     if not isinstance(config.final.get("page"), DictConfig):  # else the exporter's settings are typed
@@ -121,19 +121,19 @@ def resolve_auto(asked: Composed, scene: Scene, device_type: str = "cpu") -> Com
     if config.budget.seconds == AUTO:
         config.budget.seconds = seconds
     if config.budget.seconds is None and config.trainer.max_steps is None and config.trainer.max_epochs is None:
-        begun = None if former is None else _number(former, "trainer.max_steps")
+        begun = None if resumed is None else _number(resumed, "trainer.max_steps")
         config.trainer.max_steps = begun or config.trainer.published_steps
     if config.evaluation.max_views == AUTO:
-        if former is not None:
-            config.evaluation.max_views = _number(former, "evaluation.max_views")
+        if resumed is not None:
+            config.evaluation.max_views = _number(resumed, "evaluation.max_views")
         else:
             config.evaluation.max_views = _views_for(scene, config) if device_type == "cpu" else None
     return replace(fitted, config=config)
 
 
-def _writes_page(asked: Composed, seconds: int | float | None) -> bool:
+def _writes_page(requested: Composed, seconds: int | float | None) -> bool:
     """Return whether the page of a capture is written although it was not requested."""
-    photographs = asked.choices.get("model") == PHOTOGRAPHS and asked.config.final.get("page") == AUTO
+    photographs = requested.choices.get("model") == PHOTOGRAPHS and requested.config.final.get("page") == AUTO
     return photographs and seconds is not None and seconds >= PAGE_FROM and "page" in option_names("what")
 
 
@@ -162,29 +162,29 @@ def _number(config: Mapping[str, Any], key: str) -> int | float | None:
     return value if isinstance(value, int | float) and value > 0 else None
 
 
-def fit_model(asked: Composed, scene: Scene, on_gpu: bool, seconds: int | float | None = None) -> Composed:
+def fit_model(requested: Composed, scene: Scene, on_gpu: bool, seconds: int | float | None = None) -> Composed:
     """Return a config with what model=auto means for a scene, if it was chosen; what the user has typed stays.
 
     `seconds` of training; None: unknown.
     """
-    if asked.choices.get("model") != AUTO:
-        return asked
-    typed, former = asked.typed, asked.former
-    fitted = asked.composed_with(
-        _for_scene(scene, typed, on_gpu, seconds) if former is None else _as_begun(scene, typed, former)
+    if requested.choices.get("model") != AUTO:
+        return requested
+    typed, resumed = requested.typed, requested.resumed
+    fitted = requested.composed_with(
+        _for_scene(scene, typed, on_gpu, seconds) if resumed is None else _as_begun(scene, typed, resumed)
     )
-    for section in {"paths", "scene", "final"} & asked.config.keys():  # settled by now
-        fitted.config[section] = asked.config[section]
+    for section in {"paths", "scene", "final"} & requested.config.keys():  # settled by now
+        fitted.config[section] = requested.config[section]
     return fitted
 
 
-def settled(config: Mapping[str, Any]) -> list[str]:
+def chosen_numbers(config: Mapping[str, Any]) -> list[str]:
     """Return the overrides that repeat the numbers that model=auto has chosen for a run, by the run's config.
 
     Missing sections and values that are not integers are skipped: the config is untrusted.
     """
     values = leaves(config)
-    return [f"{key}={values[key]}" for key in SETTLED if type(values.get(key)) is int]
+    return [f"{key}={values[key]}" for key in CHOSEN_NUMBERS if type(values.get(key)) is int]
 
 
 def _for_scene(scene: Scene, typed: set[str], on_gpu: bool, seconds: int | float | None) -> list[str]:
@@ -201,10 +201,10 @@ def _for_scene(scene: Scene, typed: set[str], on_gpu: bool, seconds: int | float
     return suited + (_for_gpu(name, typed) if on_gpu else [])
 
 
-def _as_begun(scene: Scene, typed: set[str], former: Mapping[str, Any]) -> list[str]:
+def _as_begun(scene: Scene, typed: set[str], resumed: Mapping[str, Any]) -> list[str]:
     """Return the model of a run that is resumed, and the numbers that were chosen for it."""
     name = model_for(scene)[0]
-    numbers = [each for each in settled(former) if key_of(each) not in typed]
+    numbers = [each for each in chosen_numbers(resumed) if key_of(each) not in typed]
     if has_large_pictures(scene) and f"data.batch_rays={GPU_BATCHES[LARGE]['data.batch_rays']}" in numbers:
         name = LARGE
     loss = _loss_for(scene, typed) if name == PHOTOGRAPHS else []
@@ -283,25 +283,25 @@ def _for_gpu(model: str, typed: set[str]) -> list[str]:
     return larger
 
 
-def resolve_correction(asked: Composed, finding: str | None = None) -> Composed:
+def resolve_correction(requested: Composed, finding: str | None = None) -> Composed:
     """Return the config with the correction that the photographs need, unless the user has typed one.
 
     `finding` is what the doctor says of their exposure; None: nothing. A resumed run keeps its own.
     """
-    if asked.choices.get("correction") != AUTO:
-        return asked
-    if asked.former is None:
+    if requested.choices.get("correction") != AUTO:
+        return requested
+    if requested.resumed is None:
         cause = finding
     else:
-        section = asked.former.get("correction")
+        section = requested.resumed.get("correction")
         kept = isinstance(section, dict) and section.get("_target_") == EXPOSURE
         cause = "the run began with it" if kept else None
     name = "exposure" if cause else "none"
     if cause:
         log.info("correction: exposure, since %s (correction=none leaves colors unchanged)", cause)
-        exposure = compose_config(asked.command, [*asked.overrides, "correction=exposure"]).config.correction
-        asked = asked.with_setting("correction", exposure)
-    return replace(asked, choices={**asked.choices, "correction": name})
+        exposure = compose_config(requested.command, [*requested.overrides, "correction=exposure"]).config.correction
+        requested = requested.with_setting("correction", exposure)
+    return replace(requested, choices={**requested.choices, "correction": name})
 
 
 def _settle(section: DictConfig, key: str, value: bool) -> None:

@@ -28,7 +28,7 @@ class Composed:
     choices: Mapping[str, str]
     """The name picked from each group."""
     overrides: Sequence[str] = ()
-    former: Mapping[str, Any] | None = None
+    resumed: Mapping[str, Any] | None = None
     """The config of the run that is resumed, whose choices are kept; untrusted. None: there is none."""
 
     @property

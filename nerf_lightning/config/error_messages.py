@@ -175,21 +175,22 @@ def _no_option(group: str, name: str) -> str | None:
     return f"There is no {group}={name}.{cure} nerf help {group} lists them."
 
 
-def _no_setting(name: str, value: str | None, asked: Command) -> str:
-    having = listed(dict.fromkeys(each.source for each in asked.settings if each.key == name), cap=4)
+def _no_setting(name: str, value: str | None, command: Command) -> str:
+    having = listed(dict.fromkeys(each.source for each in command.settings if each.key == name), cap=4)
     if having:
         instead = " scene=bricks is rendered, in the size scene.resolution=N." if name == "scene.downscale" else ""
         return f"{name} is a setting of {having}, which is not chosen.{instead} nerf help {name} explains it."
-    told = f"nerf {asked.name} has no setting {name}."
+    told = f"nerf {command.name} has no setting {name}."
     section, _, argument = name.partition(".")
     if section == "trainer" and argument in LIGHTNING_ARGUMENTS:
         return f"{told} What Lightning's Trainer calls {argument} is {LIGHTNING_ARGUMENTS[argument]} here."
     training = command_named("train")
     if training is not None and name in known_names(training):
-        return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."
-    names = known_names(asked)
+        own = f"nerf {command.name} --help lists what {command.name} has."
+        return f"{told} It belongs to training: nerf help {name}. {own}"
+    names = known_names(command)
     close = sorted(each for each in names if each.rpartition(".")[2] == name)[:3] or near(name, names)
     if close:
         given = f"={value}" if value and PLAIN.fullmatch(value) else ""
         return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"
-    return f"{told} nerf {asked.name} --help lists what it has; +{name}=VALUE adds one of your own."
+    return f"{told} nerf {command.name} --help lists what it has; +{name}=VALUE adds one of your own."

@@ -55,10 +55,10 @@ def build_exporter(config: DictConfig, name: str) -> Any:
     return build(config.what)
 
 
-def _exporter(name: str, asked: Any) -> Any:
-    if asked is not True and not isinstance(asked, DictConfig):
-        raise InputError(f"final.{name}={asked}: give true, or settings of nerf export: final.{name}.KEY=VALUE.")
-    settings = {} if asked is True else flatten(asked)
+def _exporter(name: str, requested: Any) -> Any:
+    if requested is not True and not isinstance(requested, DictConfig):
+        raise InputError(f"final.{name}={requested}: give true, or settings of nerf export: final.{name}.KEY=VALUE.")
+    settings = {} if requested is True else flatten(requested)
     overrides = [f"what.{key}={quoted(value)}" for key, value in settings.items()]
     try:
         with in_words("export"):

@@ -45,7 +45,7 @@ def scene_overrides(path: str) -> list[str]:
         raise UnknownScene(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
     ours = _settings_of(conf_file(f"scene/{name}"))
     values = _taken(leaves(recorded, "scene"), leaves(ours, "scene"), path)
-    values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
+    values |= {key: _resolved_path(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
     if ours.get("download") and not os.path.exists(str(values.get("scene.path"))):
         values.pop("scene.path", None)  # downloads are where our YAML says, not where an untrusted file does
     return [f"scene={name}", *(f"{key}={quoted(value)}" for key, value in values.items())]
@@ -81,12 +81,12 @@ def _is_taken(key: str, value: Any) -> bool:
     return (key in PLACES and isinstance(value, str)) or meaning_of(key).trust.takes(value)
 
 
-def _found(place: str, checkpoint: Path) -> str:
+def _resolved_path(path: str, checkpoint: Path) -> str:
     try:
-        if Path(place).expanduser().is_absolute() or Path(place).exists():
-            return place
+        if Path(path).expanduser().is_absolute() or Path(path).exists():
+            return path
         note = read_plain_yaml(checkpoint.parent.parent / ".hydra" / "hydra.yaml")
-        there = Path(note["runtime"]["cwd"]) / place
-        return str(there) if there.exists() else place
+        there = Path(note["runtime"]["cwd"]) / path
+        return str(there) if there.exists() else path
     except (OSError, RuntimeError, ValueError, TypeError, KeyError, InputError):
-        return place
+        return path

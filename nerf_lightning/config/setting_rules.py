@@ -24,8 +24,8 @@ class Trust(Enum):
     PLAIN = auto()  # texts that look nothing up, and paths that stay below the folder that they are relative to
     WORDS = auto()  # single words, not paths or addresses
     NUMBERS = auto()  # no texts
-    PLACE = auto()  # paths of the capture, wherever it is
-    IF_THERE = auto()  # as PLACE, but only existing paths: some scenes download to them
+    PATHS = auto()  # paths of the capture, wherever it is
+    IF_THERE = auto()  # as PATHS, but only existing paths: some scenes download to them
     ONE_START = auto()  # nothing: it belongs to one start of a run, and the next one has its own
     NOTHING = auto()  # nothing: a file with it is refused, or it is ignored where that is safe
 
@@ -52,7 +52,7 @@ class Meaning:
     """A run's outputs depend on it: one that finished with another value has something left to do."""
     learnt: bool = True
     """What is learned depends on it: results with different values are not repetitions of one measurement."""
-    shown: bool = True
+    has_column: bool = True
     """It has a column in a table of runs that differ in it."""
     trust: Trust = Trust.NOTHING
     """What is accepted from a run folder, the record of a sweep, or a checkpoint."""
@@ -65,7 +65,7 @@ PART = Meaning(trust=Trust.WORDS)
 # Data: a reader's settings, such as the folders in a capture.
 LEARNT = Meaning(trust=Trust.PLAIN)
 # It identifies the results, and has its own column in a table.
-OWN_COLUMN = Meaning(learnt=False, shown=False, trust=Trust.PLAIN)
+OWN_COLUMN = Meaning(learnt=False, has_column=False, trust=Trust.PLAIN)
 # The machine, and how it computes; a run's initial checkpoint.
 MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
 # The length of a run: a longer one resumes from a shorter one's checkpoints.
@@ -73,9 +73,9 @@ LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
 # What observes the training.
 WATCHING = Meaning(identity=False, learnt=False, trust=Trust.WORDS)
 # What follows the training, or does not affect it.
-AFTERWARDS = replace(WATCHING, shown=False, trust=Trust.PLAIN)
+AFTERWARDS = replace(WATCHING, has_column=False, trust=Trust.PLAIN)
 # Where to write, and how to serve and limit this start; the viewer opens a server for the current user.
-ONE_START = Meaning(identity=False, outcome=False, learnt=False, shown=False, trust=Trust.ONE_START)
+ONE_START = Meaning(identity=False, outcome=False, learnt=False, has_column=False, trust=Trust.ONE_START)
 # Where to write, what to fetch, and how far to trust: only the user decides.
 OF_THE_USER = replace(ONE_START, trust=Trust.NOTHING)
 
@@ -87,7 +87,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     ),
     (LEARNT, "scene.** trainer.clip_norm"),
     (OWN_COLUMN, "seed model scene scene.name"),
-    (replace(OWN_COLUMN, trust=Trust.PLACE), "scene.root scene.video"),
+    (replace(OWN_COLUMN, trust=Trust.PATHS), "scene.root scene.video"),
     (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched if it does not exist
     (MACHINE, "trainer.** init_from"),
     (replace(MACHINE, identity=False), "trainer.cuda_graph"),  # the same steps, launched differently

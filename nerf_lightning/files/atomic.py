@@ -68,8 +68,8 @@ def persistently(change: Callable[..., None], *arguments: Any) -> None:
 
 
 @contextmanager
-def full_disk_named(place: Path) -> Iterator[None]:
-    """Name the location of a full disk, an exhausted quota or a file-size limit: `place`, if nothing closer is known.
+def full_disk_named(path: Path) -> Iterator[None]:
+    """Name the location of a full disk, an exhausted quota or a file-size limit: `path`, if nothing closer is known.
 
     The system names no file; a copy names the file that it reads.
     """
@@ -77,7 +77,7 @@ def full_disk_named(place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in NO_ROOM:
-            error.filename, error.filename2 = str(error.filename2 or error.filename or place), None
+            error.filename, error.filename2 = str(error.filename2 or error.filename or path), None
         raise
 
 

@@ -29,11 +29,11 @@ def _speaks() -> bool:
     return distributed is None or not distributed.is_initialized() or distributed.get_rank() == 0
 
 
-def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
+def progress_bar(*columns: ProgressColumn | str, visible: bool = True) -> Progress:
     """Return a bar that disappears when done; it is silent if stderr is not a terminal."""
     console = Console(stderr=True)
-    shown = shown and console.is_terminal and _speaks()
-    return Progress(*columns, console=console, transient=True, disable=not shown)
+    visible = visible and console.is_terminal and _speaks()
+    return Progress(*columns, console=console, transient=True, disable=not visible)
 
 
 class ProgressLines:
@@ -41,15 +41,15 @@ class ProgressLines:
 
     def __init__(self) -> None:
         console = Console(stderr=True)
-        self.shown = _speaks() and not console.is_terminal
-        self.began = self.told = time.monotonic()
+        self.visible = _speaks() and not console.is_terminal
+        self.began = self.last_logged = time.monotonic()
 
     def __call__(self, what: str, fraction: float) -> None:
         """Log progress if it is time; `fraction` is of the whole."""
         now = time.monotonic()
-        if not self.shown or now - self.told < LINE_SECONDS or not 0 < fraction < 1:
+        if not self.visible or now - self.last_logged < LINE_SECONDS or not 0 < fraction < 1:
             return
-        self.told = now
+        self.last_logged = now
         left = f", about {spoken((now - self.began) * (1 - fraction) / fraction)} left"
         log.info("%s: %.0f %%%s", what, 100 * fraction, left if fraction >= FORESEEN_FROM else "")
 

@@ -56,9 +56,9 @@ def for_markdown(text: str) -> str:
     """
     text = html.escape(for_terminal(text).strip(), quote=False)
     # An underscore between letters, of which our names have many, is not markup.
-    text = MARKUP.sub(lambda found: f"{found[0][:-1]}\\{found[0][-1]}", text)
+    text = MARKUP.sub(lambda match: f"{match[0][:-1]}\\{match[0][-1]}", text)
     # URLs become links without any markup.
-    return ADDRESS.sub(lambda found: f"&#{ord(found[0])};", text)
+    return ADDRESS.sub(lambda match: f"&#{ord(match[0])};", text)
 
 
 def as_code(text: str) -> str:

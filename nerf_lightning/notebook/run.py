@@ -80,7 +80,7 @@ class StepwiseRun(Run):
             batch = next(rays).to(train_step.device)
             seen = train_step(batch, optimizer)
             self.num_steps += 1
-            self.collapse_guard.look(train_step, batches, optimizer, seen, self.num_steps)
+            self.collapse_guard.check(train_step, batches, optimizer, seen, self.num_steps)
             if cause := self.nan_guard.cause(train_step):
                 raise InputError(f"{cause}, so the run stops. Start again, or resume a checkpoint, with {CURE}.")
             measured = {"loss": float(seen.losses.sum()), "psnr": float(psnr(seen.color_errors[-1]))}
@@ -146,7 +146,7 @@ class StepwiseRun(Run):
             callbacks=[guard] if guard.state_key in kept else [],  # a Trainer may have trained it without one
             loops=loops_after(0),
             progress=train_step.progress,
-            together=train_step.objective.pixels_per_patch,
+            multiple_of=train_step.objective.pixels_per_patch,
         )
         restore_run(state, train_step, train_step.device)
         self.system.load_state_dict(content["state_dict"])
@@ -195,7 +195,7 @@ def build_run(
         settings.keep_tile(former.tile_points)
     settings.prepare_machine()
     if former is not None:
-        asked = replace(asked, former=plain_yaml(former.config, str(former.path)))
+        asked = replace(asked, resumed=plain_yaml(former.config, str(former.path)))
     config.budget.seconds = None  # Lightning's Trainer, or `steps`, ends it
     planned = plan_run(asked, settings, scene, model, loss)
     guards = planned.config.callbacks

@@ -37,10 +37,10 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     """Return the numbers on top of a page."""
     median, worst = mapping(metrics.get("median")), mapping(mapping(metrics.get("worst")).get("psnr"))
     shown = [
-        ("PSNR (mean)", _shown("psnr", metrics.get("psnr"))),
-        ("PSNR (median)", _shown("psnr", median.get("psnr"))),
-        ("PSNR (worst view)", _shown("psnr", worst.get("value"))),
-        *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
+        ("PSNR (mean)", _formatted("psnr", metrics.get("psnr"))),
+        ("PSNR (median)", _formatted("psnr", median.get("psnr"))),
+        ("PSNR (worst view)", _formatted("psnr", worst.get("value"))),
+        *((label, _formatted(metric, metrics.get(metric))) for metric, label in LABELS.items()),
     ]
     count, of = number(metrics.get("num_images")), number(metrics.get("split_views"))
     if count is not None and of is not None:
@@ -64,7 +64,7 @@ def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Return the columns and the rows of the table of all views; columns that no view has are left out."""
     rows = [row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)][:MOST_ROWS]
     columns = [column for column in COLUMNS if any(row.get(column) is not None for row in rows)]
-    texts = [[str(row.get(c, ""))[:200] if c == "name" else _shown(c, row.get(c)) for c in columns] for row in rows]
+    texts = [[str(row.get(c, ""))[:200] if c == "name" else _formatted(c, row.get(c)) for c in columns] for row in rows]
     return [column.replace("_", " ") for column in columns], texts
 
 
@@ -103,12 +103,12 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
 def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
     files = {part: folder / f"{part}.png" for part in PARTS}
     parts = {part: embedded_file(file) for part, file in files.items() if part != "true_depth" or file.is_file()}
-    known = {metric: _shown(metric, row.get(metric)) for metric in ("psnr", "ssim")}
+    known = {metric: _formatted(metric, row.get(metric)) for metric in ("psnr", "ssim")}
     numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)
 
 
-def _shown(metric: str, value: Any) -> str:
+def _formatted(metric: str, value: Any) -> str:
     known = number(value)
     return "" if known is None else FORMATS[metric].format(known)
 

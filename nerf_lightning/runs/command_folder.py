@@ -17,23 +17,23 @@ def beside_checkpoint(checkpoint: Path, name: str) -> Path:
     return (beside.parent if beside.name == "checkpoints" else beside) / name
 
 
-def chosen_folder(given: str | None, default: Path) -> Path:
-    """Return the output folder of a command that does not train: as given, or the default. Nothing is made yet.
+def chosen_folder(output_dir: str | None, default: Path) -> Path:
+    """Return the output folder of a command that does not train: `output_dir`, or the default. Nothing is made yet.
 
     The jobs of a sweep have folders of their own.
 
     Raises:
         InputError: it contains links that lead out of it.
     """
-    if given is None:
+    if output_dir is None:
         # Next to an untrusted checkpoint.
         require_no_way_out(default.parent if default.is_symlink() else default)
-    return job_folder() or Path(given or default)
+    return job_folder() or Path(output_dir or default)
 
 
-def output_folder(given: str | None, default: Path) -> Path:
+def output_folder(output_dir: str | None, default: Path) -> Path:
     """Make the folder that `chosen_folder` returns, check that it is writable, and return it."""
-    folder = chosen_folder(given, default)
+    folder = chosen_folder(output_dir, default)
     try:
         make_folder(folder)
         # With an unpredictable name, so that no link can have been planted there.
@@ -47,12 +47,12 @@ def output_folder(given: str | None, default: Path) -> Path:
 
 
 @contextmanager
-def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
+def filled_folder(output_dir: str | None, default: Path) -> Iterator[Path]:
     """Yield the folder that `output_folder` returns; remove newly made folders that are empty at the end."""
-    wanted = chosen_folder(given, default).absolute()
+    wanted = chosen_folder(output_dir, default).absolute()
     made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
     try:
         with full_disk_named(wanted):
-            yield output_folder(given, default)
+            yield output_folder(output_dir, default)
     finally:
         remove_empty(*made)

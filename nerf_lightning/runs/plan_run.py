@@ -46,7 +46,7 @@ class Run:
 
 
 def plan_run(
-    asked: Composed,
+    requested: Composed,
     settings: TrainerSettings,
     scene: Scene | None = None,
     model: Model | None = None,
@@ -55,7 +55,7 @@ def plan_run(
     """Read the scene, choose what the config leaves open, examine the capture, and build; nothing is written.
 
     Args:
-        asked: the config of `nerf train`; checkpoints keep what was picked from each group.
+        requested: the config of `nerf train`; checkpoints keep what was picked from each group.
         settings: of the machine.
         scene: replaces the config's.
         model: replaces the config's.
@@ -64,8 +64,8 @@ def plan_run(
     Raises:
         InputError: the config or the capture does not allow a run.
     """
-    asked, scene = read_scene(asked, settings.device_type == "cuda", scene)
-    planned = resolve_auto(asked, scene, settings.device_type)
+    requested, scene = read_scene(requested, settings.device_type == "cuda", scene)
+    planned = resolve_auto(requested, scene, settings.device_type)
     settings.max_steps = planned.config.trainer.max_steps
     checks = ranks.from_first(lambda: require_sound(scene)) if planned.config.doctor else None
     planned = resolve_correction(planned, exposure_finding(checks))
@@ -73,11 +73,11 @@ def plan_run(
     return Run(planned.config, settings, scene, checks, data, system)
 
 
-def read_scene(asked: Composed, on_gpu: bool, scene: Scene | None = None) -> tuple[Composed, Scene]:
+def read_scene(requested: Composed, on_gpu: bool, scene: Scene | None = None) -> tuple[Composed, Scene]:
     """Return the config with the size of the photographs, and the scene, with distances if the loss needs them."""
-    asked = with_longest(asked, on_gpu)
-    scene = build(asked.config.scene).read() if scene is None else scene
-    return asked, with_distances(scene) if takes_distances(asked, scene) else scene
+    requested = with_longest(requested, on_gpu)
+    scene = build(requested.config.scene).read() if scene is None else scene
+    return requested, with_distances(scene) if takes_distances(requested, scene) else scene
 
 
 def _built(

@@ -122,7 +122,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     seconds = number(note.get("training_seconds"))
     values["minutes"] = None if seconds is None else seconds / 60
     # `scene@PACKAGE` picks from the same group as `scene`.
-    settings = {k: v for k, v in run.overrides.items() if meaning_of(k.lstrip("+~").partition("@")[0]).shown}
+    settings = {k: v for k, v in run.overrides.items() if meaning_of(k.lstrip("+~").partition("@")[0]).has_column}
     return RunResult(
         summary=run,
         scene=scene_name(protocol, origin, run.overrides),

@@ -116,7 +116,7 @@ def open_run(
     config: DictConfig,
     num_steps: int,
     job_folder: Path | None,
-    asked: DictConfig | None = None,
+    requested: DictConfig | None = None,
     typed: Sequence[str] = (),
 ) -> RunFolder:
     """Choose the run's folder, refuse or lock it, and write the config.
@@ -126,7 +126,7 @@ def open_run(
         num_steps: its length; a run that finished with fewer steps counts as unfinished, as does one with a shorter
             budget.
         job_folder: the folder that a sweep gives this job, or None for a single run.
-        asked: the config before anything was chosen for the scene, which is what a sweep knows about a job in advance.
+        requested: the config before anything was chosen for the scene; a sweep knows only this of a job in advance.
         typed: the overrides of the command line.
 
     Raises:
@@ -159,7 +159,7 @@ def open_run(
     kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0}
     kept |= {key: note[key] for key in (*kept, "training_seconds", "setup_seconds", "num_steps") if key in note}
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
-    settings = settings_digest(config if asked is None else asked)
+    settings = settings_digest(config if requested is None else requested)
     write_json(folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings} | kept | job)
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)

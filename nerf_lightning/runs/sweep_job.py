@@ -87,13 +87,13 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     return value
 
 
-def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
-    log.info("job %d has finished before: %s", record.number, former)
+def _skip(record: JobRecord, run_folder: Path, sweep_folder: Path) -> float | None:
+    log.info("job %d has finished before: %s", record.number, run_folder)
     own = Path(record.folder)
-    if former != own:
+    if run_folder != own:
         remove_empty(own)
-    replace(record, folder=str(former), state="finished before").write(sweep_folder)
-    return number(read_note(former).get("psnr"))
+    replace(record, folder=str(run_folder), state="finished before").write(sweep_folder)
+    return number(read_note(run_folder).get("psnr"))
 
 
 def job_label(number: int, folder: Path, overrides: list[str]) -> str:

@@ -46,29 +46,29 @@ MOST_LETTERS = 80
 Group = list[RunResult]
 
 
-def result_table(found: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
+def result_table(results: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
     """Return the rows, in one of `ORDERS`, and the notes below them.
 
     `force` combines results that were not measured in the same way.
     """
-    notes = one_protocol(found.measured, force)
-    groups, left_out = group_seeds(found.measured)
+    notes = one_protocol(results.measured, force)
+    groups, left_out = group_seeds(results.measured)
     groups.sort(key=lambda group: _rank(group, order))
     differing = differing_keys([group[0].settings for group in groups])
     shown, hidden = differing[:MOST_SETTINGS], differing[MOST_SETTINGS:]
     rows = [_row(group, shown) for group in groups]
     if published:
-        rows = with_published(rows, found.measured)
+        rows = with_published(rows, results.measured)
     if hidden:
         notes.append(f"{len(hidden)} more settings differ and have no column: {listed(hidden, cap=5)}.")
     for key in NOTED:
-        values = sorted({str(result.origin.get(key, "not said")) for result in found.measured})
+        values = sorted({str(result.origin.get(key, "not said")) for result in results.measured})
         notes += [f"{key}: {', '.join(values)}"] if len(values) > 1 else []
     if left_out:
         names = listed((result.folder for result in left_out), cap=5)
         notes.append(f"Left out, because there are newer runs with the same settings and seed: {names}.")
-    if found.unmeasured:
-        notes.append(f"Without a PSNR in {found.file}: {listed(found.unmeasured, cap=5)}.")
+    if results.unmeasured:
+        notes.append(f"Without a PSNR in {results.file}: {listed(results.unmeasured, cap=5)}.")
     columns = [name for name in rows[0] if any(row[name] not in (None, "") for row in rows)]
     return [{name: row[name] for name in columns} for row in rows], notes
 
@@ -86,19 +86,19 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
     for result in results:
         first = first_of.setdefault(result.scene, result)
         for other, same_scene in ((first, True), (results[0], False)):
-            apart = _apart(other, result, same_scene)
-            if apart and not force:
+            reasons = _protocol_differences(other, result, same_scene)
+            if reasons and not force:
                 raise InputError(
-                    f"{other.folder} and {result.folder} were not measured the same way ({'; '.join(apart)}), so one "
+                    f"{other.folder} and {result.folder} were not measured the same way ({'; '.join(reasons)}), so one "
                     "table cannot compare them. Leave one out (scenes=..., models=..., or fewer runs), measure both "
                     "the same way with nerf eval and add measured=eval, or add force=true."
                 )
-            for difference in apart:
+            for difference in reasons:
                 pairs.setdefault(difference, f"{other.folder} and {result.folder}")
     return [f"Not all of these were measured the same way: {pair}: {difference}." for difference, pair in pairs.items()]
 
 
-def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
+def _protocol_differences(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
     """Return why two results cannot be compared, in words and as settings."""
     found = dict(each.split(": ", 1) for each in differences(one.protocol, other.protocol, same_scene))
     is_other_pictures = found.pop("split_hash", None) is not None and not found.keys() & {*CHOOSE_PICTURES}
@@ -155,11 +155,11 @@ def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
     return table
 
 
-def _row(group: Group, shown: list[str]) -> Row:
+def _row(group: Group, keys: list[str]) -> Row:
     first = group[0]
     row: Row = {"scene": first.scene, "model": first.model}
-    unsaid = _values_of(first.folder, [key for key in shown if key not in first.settings])
-    row |= {key: first.settings.get(key, unsaid.get(key, "")) for key in shown}
+    unsaid = _values_of(first.folder, [key for key in keys if key not in first.settings])
+    row |= {key: first.settings.get(key, unsaid.get(key, "")) for key in keys}
     seeds = sorted(result.seed for result in group if result.seed is not None)
     row |= {"resolution": _resolution(first), "seeds": " ".join(map(str, seeds))}
     for metric, column in SPREAD.items():

@@ -26,15 +26,15 @@ def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
         if name in SECONDS or name == "time":
             columns["time"] = [_time(row) for row in rows]
         elif not name.endswith(" std"):
-            deviations = [shown(row, f"{name} std") for row in rows]
+            deviations = [cell_text(row, f"{name} std") for row in rows]
             pairs = zip(rows, deviations, strict=True)
-            columns[name] = [shown(row, name) + (f" ± {of}" if of else "") for row, of in pairs]
+            columns[name] = [cell_text(row, name) + (f" ± {of}" if of else "") for row, of in pairs]
     if "model" in columns:
         columns["model"] = [f"{row['model']}{' (published)' if row.get('source') else ''}" for row in rows]
     return columns
 
 
-def shown(row: Row, column: str) -> str:
+def cell_text(row: Row, column: str) -> str:
     """Return the displayed text of a value."""
     value = row.get(column)
     if value is None:

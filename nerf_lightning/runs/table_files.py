@@ -12,7 +12,7 @@ from typing import Any
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_csv, for_markdown
 from nerf_lightning.runs.table import HIGH_FIRST, PLAIN, SPREAD
-from nerf_lightning.runs.table_cells import Row, shown, shown_columns
+from nerf_lightning.runs.table_cells import Row, cell_text, shown_columns
 
 HIGHEST = tuple((SPREAD | PLAIN)[key] for key in HIGH_FIRST)
 LOWEST = tuple(column for column in SPREAD.values() if column not in HIGHEST)
@@ -32,7 +32,8 @@ def write_csv(rows: list[Row], path: Path) -> None:
 
 def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> None:
     """Write the rows as a Markdown table, with the notes below."""
-    head, *lines = ([*map(for_markdown, line)] for line in (rows[0], *([shown(row, c) for c in row] for row in rows)))
+    cells = ([cell_text(row, column) for column in row] for row in rows)
+    head, *lines = ([*map(for_markdown, line)] for line in (rows[0], *cells))
     text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *lines))
     with whole_file(path) as part:
         part.write_text(text + "".join(f"\n{for_markdown(note)}\n" for note in notes), encoding="utf-8")
@@ -80,9 +81,9 @@ def _with_best_bold(name: str, cells: list[str], rows: list[Row]) -> list[str]:
     return [rf"\textbf{{{cell}}}" if row.get(name) == best else cell for cell, row in zip(cells, rows, strict=True)]
 
 
-def _caption(shown: dict[str, list[str]], columns: dict[str, list[str]], protocol: dict[str, Any]) -> str:
+def _caption(texts: dict[str, list[str]], columns: dict[str, list[str]], protocol: dict[str, Any]) -> str:
     """Return what all rows have in common, and how their pictures were compared."""
-    same = [f"{name} {cells[0]}" for name, cells in shown.items() if name not in columns and cells[0]]
+    same = [f"{name} {cells[0]}" for name, cells in texts.items() if name not in columns and cells[0]]
     told = f"{protocol.get('split', '')} views, {protocol.get('background', '')} background"
     how = [f"PSNR: {protocol['psnr']}"] if "psnr" in protocol and "PSNR" in columns else []
     how += [f"SSIM: {protocol['ssim']}"] if "ssim" in protocol and "SSIM" in columns else []

@@ -27,16 +27,16 @@ def restart(train_step: TrainStep, optimizer: Optimizer) -> None:
     optimizer.state.clear()
 
 
-def count_rollback(train_step: TrainStep, former: Progress, skipped: int) -> None:
+def count_rollback(train_step: TrainStep, previous: Progress, skipped: int) -> None:
     """Begin a new attempt, with other random numbers, from the state that was just restored.
 
     Args:
         train_step: the run's training step.
-        former: the run's progress before.
+        previous: the run's progress before.
         skipped: number of steps skipped before.
     """
     progress = train_step.progress
-    progress.attempt, progress.rollbacks = former.attempt + 1, former.rollbacks + 1
+    progress.attempt, progress.rollbacks = previous.attempt + 1, previous.rollbacks + 1
     train_step.guard.restore([skipped, 0], train_step.device)
     _forget_recordings(train_step)
 

@@ -79,7 +79,7 @@ def require_resumable(
     callbacks: Iterable[Any],
     loops: Mapping[str, Any],
     progress: Progress,
-    together: int,
+    multiple_of: int,
 ) -> None:
     """Refuse a checkpoint that is valid in itself but does not belong to this run.
 
@@ -93,7 +93,7 @@ def require_resumable(
             that are part of the computation (`needs_state`) must be present.
         loops: the state of the trainer's loops.
         progress: the run's progress, as set up by the loader.
-        together: number of consecutive pixels of a batch that are not separated.
+        multiple_of: number of consecutive pixels that a batch does not separate; its size is a multiple.
 
     Raises:
         InputError: names the place in the checkpoint.
@@ -118,7 +118,7 @@ def require_resumable(
             raise Mismatch("loops.fit_loop", f"has not taken the {content['global_step']} steps of the checkpoint")
         # These two determine the size of batches.
         found, largest = Progress(**content[KEY]["progress"]), progress.largest_batch
-        if found.largest_batch != largest or found.batch_rays not in batch_sizes(largest, together):
+        if found.largest_batch != largest or found.batch_rays not in batch_sizes(largest, multiple_of):
             raise Mismatch("progress", f"has {found.batch_rays} rays of {found.largest_batch}, not those of the run")
 
 

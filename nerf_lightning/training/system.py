@@ -205,6 +205,6 @@ class RadianceFieldSystem(LightningModule):
             callbacks=trainer.callbacks,  # type: ignore[attr-defined]
             loops={key: getattr(trainer, key).state_dict() for key in LOOPS},
             progress=train_step.progress,
-            together=train_step.objective.pixels_per_patch,
+            multiple_of=train_step.objective.pixels_per_patch,
         )
         restore_run(state, train_step, self.device)

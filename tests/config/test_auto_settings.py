@@ -34,7 +34,7 @@ LARGE_PICTURES = replace(IN_A_BOX, cameras=replace(IN_A_BOX.cameras, focal=IN_A_
 
 
 def resumed(asked, former):
-    return replace(asked, former=OmegaConf.to_container(former, resolve=True))
+    return replace(asked, resumed=OmegaConf.to_container(former, resolve=True))
 
 
 def chosen_for(scene, *overrides):
@@ -228,10 +228,10 @@ def test_photographs_that_are_trained_on_for_long_enough_become_a_page(scene, ty
 )
 def test_photographs_are_as_large_as_the_device_has_time_for(on_gpu, typed, former, longest):
     typed = ("scene=auto", "scene.root=a", *typed)
-    asked = with_longest(replace(compose_config("train", typed), former=former), on_gpu)
+    asked = with_longest(replace(compose_config("train", typed), resumed=former), on_gpu)
     assert (asked.config.scene.downscale, asked.config.scene.longest) == ("auto", longest)
-    assert fit_model(replace(asked, former=None), PHOTOGRAPHS, on_gpu).config.scene.longest == longest
-    built_in = replace(compose_config("train", ()), former=former)
+    assert fit_model(replace(asked, resumed=None), PHOTOGRAPHS, on_gpu).config.scene.longest == longest
+    built_in = replace(compose_config("train", ()), resumed=former)
     assert with_longest(built_in, on_gpu) is built_in
 
 
@@ -297,7 +297,7 @@ def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(
         chosen = OmegaConf.create({"correction": composed("train", f"correction={named}").correction})
         OmegaConf.save(chosen, tmp_path / ".hydra" / "config.yaml")
         asked = compose_config("train", goes_on.format(tmp_path, tmp_path).split())
-        asked = replace(asked, former=former_config(asked.config, job_folder=None))
+        asked = replace(asked, resumed=former_config(asked.config, job_folder=None))
         checks = [Check("exposure", verdict, "one differs")] if verdict else None
         resolved = resolve_correction(asked, exposure_finding(checks))
         assert resolved.choices["correction"] == named

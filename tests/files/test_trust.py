@@ -11,7 +11,7 @@ from jaxtyping import Float
 from support.running import refused
 from torch import Tensor
 
-from nerf_lightning.files.trust import Mismatch, reading, require_fit, shown
+from nerf_lightning.files.trust import Mismatch, for_message, reading, require_fit
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
@@ -80,7 +80,7 @@ def test_nothing_but_a_mismatch_comes_of_anything(value: object, kind: Any):
             message = str(problem)
         assert len(message) < 3000
         assert not message or message.isprintable()
-    assert len(shown(value)) < 300
+    assert len(for_message(value)) < 300
 
 
 @pytest.mark.parametrize(

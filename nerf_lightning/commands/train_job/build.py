@@ -47,16 +47,16 @@ class TrainJob(Run):
 
 def build_job(config: DictConfig, scene: Scene | None = None) -> TrainJob:
     """Build what a command's config specifies, and read its scene if none is given; nothing is written."""
-    asked = composed("train", config, ranks.from_first(lambda: former_config(config, job_folder())))
+    requested = composed("train", config, ranks.from_first(lambda: former_config(config, job_folder())))
     if job_folder() is not None and config.final.get("page") == AUTO:
-        asked = asked.with_setting("final.page", False)  # the runs of a sweep are compared, not handed over
-    job = assemble_job(asked, scene)
+        requested = requested.with_setting("final.page", False)  # the runs of a sweep are compared, not handed over
+    job = assemble_job(requested, scene)
     if job_folder() is not None:
         job.signals.stop_file = stop_file(Path(HydraConfig.get().sweep.dir))
     return job
 
 
-def assemble_job(asked: Composed, scene: Scene | None = None) -> TrainJob:
+def assemble_job(requested: Composed, scene: Scene | None = None) -> TrainJob:
     """Build all parts of a `nerf train` run and read its scene; nothing is written.
 
     What the config leaves open is chosen for the scene; checkpoints keep the choices.
@@ -64,15 +64,15 @@ def assemble_job(asked: Composed, scene: Scene | None = None) -> TrainJob:
     Raises:
         InputError: the config or the capture does not allow a run.
     """
-    settings: TrainerSettings = build(asked.config.trainer)
+    settings: TrainerSettings = build(requested.config.trainer)
     if settings.launched_by == "nerf":
         require_one_task()
     settings.prepare_machine()
-    post_training, loggers = PostTraining.from_config(asked.config), build(asked.config.logger)
+    post_training, loggers = PostTraining.from_config(requested.config), build(requested.config.logger)
     for each in loggers.values() if ranks.is_first() else ():
         if isinstance(each, WeightsAndBiases):
             each.require_access()
-    run = plan_run(asked, settings, scene)
+    run = plan_run(requested, settings, scene)
     config = run.config
     post_training.exports = exporters_after_training(config.final)  # of what was left open, too
     post_training.require_film(run.scene)
@@ -94,11 +94,11 @@ def assemble_job(asked: Composed, scene: Scene | None = None) -> TrainJob:
     )
 
 
-def composed(command: str, config: DictConfig, former: Mapping[str, Any] | None = None) -> Composed:
+def composed(command: str, config: DictConfig, resumed: Mapping[str, Any] | None = None) -> Composed:
     """Return the config of this command with its overrides, to compose again what is left open."""
     hydra = HydraConfig.get()
     overrides = [*searchpath_override(), *hydra.overrides.task]
-    return Composed(command, config, picked(hydra.runtime.choices), overrides, former)
+    return Composed(command, config, picked(hydra.runtime.choices), overrides, resumed)
 
 
 def searchpath_override() -> list[str]:

@@ -36,14 +36,14 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         SystemExit: a signal stopped the training, which was saved (128 + signal).
         InputError: the GPU has failed.
     """
-    former = folder.former
+    resume_point = folder.resume_point
     _keep_end(job, folder)
     _prepare(job, folder)
     trainer = job.settings.build(folder.path, job.num_steps, job.callbacks, folder.loggers)
     _announce(job, folder)
-    if former is None:
+    if resume_point is None:
         describe_run(trainer.loggers, job.config)
-    checkpoint = None if former is None else former.checkpoint
+    checkpoint = None if resume_point is None else resume_point.checkpoint
     try:
         trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
     except RuntimeError as error:
@@ -56,7 +56,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
             "not use it."
         ) from error
     if ranks.is_first():
-        steps = trainer.global_step - (0 if former is None else former.step)
+        steps = trainer.global_step - (0 if resume_point is None else resume_point.step)
         log.info("%d step%s in %s", steps, "s" * (steps != 1), spoken(job.clock.seconds))
     if job.signals.received is not None:
         log.info("stopped at step %d; resume with: %s", trainer.global_step, resume_command(folder.path))
@@ -72,33 +72,33 @@ def _what_is_left(folder: HeldFolder) -> str:
 
 def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
     """Make a resumed run at least as long as originally planned: its learning rate follows that length."""
-    former = folder.former
-    if former is not None and job.num_steps < former.num_steps:
+    resume_point = folder.resume_point
+    if resume_point is not None and job.num_steps < resume_point.num_steps:
         log.warning(
             "This run was planned for %d steps, and its learning rate follows that length: it continues to step %d, "
             "not %d. For a shorter run, start a new one.",
-            former.num_steps,
-            former.num_steps,
+            resume_point.num_steps,
+            resume_point.num_steps,
             job.num_steps,
         )
-        job.num_steps = former.num_steps
+        job.num_steps = resume_point.num_steps
     if job.config.budget.seconds is None:  # else the time ends it, and its learning rate follows that
         folder.note(num_steps=job.num_steps)
 
 
 def _prepare(job: TrainJob, folder: HeldFolder) -> None:
     """Move the model to its device, with the precision and tile that suit it, or that the run began with."""
-    train_step, settings, former = job.system.train_step, job.settings, folder.former
-    if former is not None:
-        log.info("resuming from step %d of %s", former.step, folder.path)
-        settings.keep_precision(former.precision)
-        settings.keep_tile(former.tile_points)
+    train_step, settings, resume_point = job.system.train_step, job.settings, folder.resume_point
+    if resume_point is not None:
+        log.info("resuming from step %d of %s", resume_point.step, folder.path)
+        settings.keep_precision(resume_point.precision)
+        settings.keep_tile(resume_point.tile_points)
         train_step.tiles.points = settings.tile_points
     settings.prepare(train_step.objective.model)
     job.system.record["precision"] = settings.precision
     # CUDA graphs record whole batches.
     measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN and not settings.records(train_step)
-    if former is None and measures_tile:
+    if resume_point is None and measures_tile:
         tile, seconds = ranks.from_first(lambda: measured_tile(settings, train_step, job.data.batches))
         train_step.tiles.points = settings.tile_points = tile
         if seconds is not None:
@@ -145,7 +145,7 @@ def _announce(job: TrainJob, folder: HeldFolder) -> None:
         job.settings.describe(),
         "steps replayed" if job.settings.records(job.system.train_step) else how,
     )
-    if folder.former is None and job.config.resume == "auto":
+    if folder.resume_point is None and job.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run with these settings to resume; starting a new run")
     trust = trust_setting(job)
     if trust:

@@ -27,7 +27,7 @@ class HeldFolder:
     """The run's folder as every process sees it; only the first one holds it, and writes how the run ended."""
 
     path: Path
-    former: ResumePoint | None
+    resume_point: ResumePoint | None
     """Where training resumes; None: from the beginning."""
     held: RunFolder | None
     loggers: list[Logger]
@@ -44,28 +44,28 @@ class HeldFolder:
 
 
 @contextmanager
-def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
+def held_folder(job: TrainJob, requested: DictConfig) -> Iterator[HeldFolder]:
     """Take the folder of a job, and open its log and loggers; note how the run ended, and release the folder.
 
-    `asked` is the config before anything was chosen for the scene.
+    `requested` is the config before anything was chosen for the scene.
     """
     held: list[RunFolder] = []
 
     def take() -> tuple[Path, ResumePoint | None]:
         hydra = HydraConfig.get()
-        held.append(open_run(job.config, job.num_steps, job_folder(), asked, hydra.overrides.task))
+        held.append(open_run(job.config, job.num_steps, job_folder(), requested, hydra.overrides.task))
         write_config(held[0].path, job.config, hydra)
         return held[0].path, held[0].resume_point()
 
     try:
-        path, former = ranks.from_first(take)
+        path, resume_point = ranks.from_first(take)
         with (
             errors_told_once(),
             full_disk_named(path),
             log_file(path) if ranks.is_first() else nullcontext(),
-            _loggers(job, path, former) as loggers,
+            _loggers(job, path, resume_point) as loggers,
         ):
-            yield HeldFolder(path, former, held[0] if held else None, loggers)
+            yield HeldFolder(path, resume_point, held[0] if held else None, loggers)
     except SystemExit as stop:
         for folder in held:
             folder.trained(job.clock.seconds)
@@ -81,11 +81,11 @@ def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
 
 
 @contextmanager
-def _loggers(job: TrainJob, folder: Path, former: ResumePoint | None) -> Iterator[list[Logger]]:
+def _loggers(job: TrainJob, folder: Path, resume_point: ResumePoint | None) -> Iterator[list[Logger]]:
     purge: dict[str, int] = {}
     if (folder / "tensorboard").exists():
         # Steps logged after the checkpoint will be logged again: tell TensorBoard to purge them.
-        purge = {"purge_step": 0 if former is None else former.step + 1}
+        purge = {"purge_step": 0 if resume_point is None else resume_point.step + 1}
     started = str(read_note(folder).get("started"))
     with opened_loggers(job.loggers if ranks.is_first() else {}, folder, started, **purge) as loggers:
         yield loggers

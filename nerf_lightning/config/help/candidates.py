@@ -33,21 +33,21 @@ def _possible(before: list[str], current: str, commands: list[str]) -> Iterable[
         return SHELLS
     if before[0] == "help":
         return [*commands, *(word.removesuffix("=") for word in _possible(["train"], current, commands))]
-    asked = command_named(before[0])
-    if asked is None:
+    command = command_named(before[0])
+    if command is None:
         return []
     if current.startswith("-"):
         return FLAGS
     if "=" in current:
-        return _values(asked, *current.split("=", 1))
-    return [*_keys(asked, current, before), *(_paths(current) if asked.name in TAKES_PATHS else ())]
+        return _values(command, *current.split("=", 1))
+    return [*_keys(command, current, before), *(_paths(current) if command.name in TAKES_PATHS else ())]
 
 
-def _keys(asked: Command, current: str, before: list[str]) -> Iterator[str]:
+def _keys(command: Command, current: str, before: list[str]) -> Iterator[str]:
     """Yield groups, and settings up to their next dot."""
     chosen = dict(word.split("=", 1) for word in before if "=" in word)
-    keys = [f"{group}=" for group in asked.options if len(option_names(group)) > 1]
-    for setting in asked.settings:
+    keys = [f"{group}=" for group in command.options if len(option_names(group)) > 1]
+    for setting in command.settings:
         group, _, name = setting.source.partition("=")
         if setting.text and setting.is_own and chosen.get(group, name) == name:
             keys.append(f"{setting.key}=")
@@ -56,10 +56,10 @@ def _keys(asked: Command, current: str, before: list[str]) -> Iterator[str]:
         yield key[: len(current)] + head + dot
 
 
-def _values(asked: Command, key: str, typed: str) -> Iterator[str]:
+def _values(command: Command, key: str, typed: str) -> Iterator[str]:
     done, comma, _ = typed.rpartition(",")
-    found = option_names(key.lstrip("+")) if key.lstrip("+") in asked.options else []
-    takes = " ".join(setting.takes for setting in asked.settings if setting.key == key.lstrip("+"))
+    found = option_names(key.lstrip("+")) if key.lstrip("+") in command.options else []
+    takes = " ".join(setting.takes for setting in command.settings if setting.key == key.lstrip("+"))
     found += re.findall(r"'([^']*)'", takes)
     found += [value for word, values in LITERALS.items() if word in takes for value in values]
     yield from (f"{key}={done}{comma}{value}" for value in found)

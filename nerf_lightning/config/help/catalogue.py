@@ -58,9 +58,9 @@ class Command:
             if group not in ("_self_", "hydra")
         }
         """With the option of the command's defaults list, in its order."""
-        places = {place(group) for group in self.groups}
+        sections = {section_of(group) for group in self.groups}
         own = {key: entry for key, entry in file.entries.items() if root(key) != "hydra"}
-        self.written = _settings(own, f"nerf {name}", lambda key: root(key) not in places)
+        self.written = _settings(own, f"nerf {name}", lambda key: root(key) not in sections)
         """The settings of its own YAML."""
 
     @cached_property
@@ -104,7 +104,7 @@ def known_names(command: Command) -> list[str]:
     return list(dict.fromkeys([*command.groups, *(setting.key for setting in command.settings)]))
 
 
-def place(group: str) -> str:
+def section_of(group: str) -> str:
     """Return the section that a group fills."""
     name, _, package = group.partition("@")
     return package or name.replace("/", ".")
@@ -123,7 +123,7 @@ def options(group: str) -> list[Option]:
 @cache
 def read_option(group: str, name: str) -> Option:
     """Read one option of a group."""
-    folder, typed, section = group.partition("@")[0], f"{group}={name}", place(group)
+    folder, typed, section = group.partition("@")[0], f"{group}={name}", section_of(group)
     file = read_commented(conf_file(f"{folder}/{name}"))
     entries, chosen = _merged(file, folder, "" if file.is_global else f"{section}.")
     settings = _settings(entries, typed, lambda key: root(key) == root(section))

@@ -19,8 +19,8 @@ def command_page(command: Command, width: int) -> str:
     `$SETTINGS: KEY ...` becomes a line for each key; `$GROUPS: NAME ...` its groups, with a line per option.
     """
 
-    def listed(found: re.Match[str]) -> str:
-        kind, names = found[1], found[2].split()
+    def listed(match: re.Match[str]) -> str:
+        kind, names = match[1], match[2].split()
         if kind == "GROUPS":
             return "\n".join(_groups(command, names, width))
         meanings = {each.key: brief(each.meaning) for each in reversed(command.settings) if each.is_own}
@@ -97,12 +97,12 @@ def _described(setting: Setting, width: int) -> str:
     return "\n".join([*lines, *([_paragraph(f"Takes {setting.takes}", width, 4)] if setting.takes else [])])
 
 
-def row(left: str, right: str, width: int) -> str:
+def row(name: str, meaning: str, width: int) -> str:
     """Return a line of a list: a name and, from a fixed column on, its meaning."""
-    start, indent = f"  {left:<{COLUMN - 3}} ", " " * COLUMN
+    start, indent = f"  {name:<{COLUMN - 3}} ", " " * COLUMN
     if len(start) > COLUMN:
-        return f"{start.rstrip()}\n{fill(right, width, initial_indent=indent, subsequent_indent=indent)}"
-    return fill(right, width, initial_indent=start, subsequent_indent=indent, break_long_words=False)
+        return f"{start.rstrip()}\n{fill(meaning, width, initial_indent=indent, subsequent_indent=indent)}"
+    return fill(meaning, width, initial_indent=start, subsequent_indent=indent, break_long_words=False)
 
 
 def _paragraph(text: str, width: int, indent: int) -> str:

@@ -34,7 +34,7 @@ def on_device(scene: Scene, device: torch.device) -> Scene:
     """Return the scene with pixels, cameras, near and far on the device; a mapped file is read once, in parts."""
     pixels = scene.pixels
     columns = ("{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with progress_bar(*columns, shown=num_bytes(pixels) > 16 * CHUNK_BYTES) as bar:
+    with progress_bar(*columns, visible=num_bytes(pixels) > 16 * CHUNK_BYTES) as bar:
         task = bar.add_task(f"pixels to {device}", total=num_bytes(pixels))
 
         def copied(flat: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:

@@ -49,7 +49,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
     """Return [work(0), ..., work(count - 1)], computed by a few threads, with a progress bar if `shown`."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     threads = min(MAX_THREADS, num_cores())
-    with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
+    with progress_bar(*columns, visible=shown) as bar, ThreadPoolExecutor(threads) as pool:
         return list(bar.track(pool.map(work, range(count)), total=count, description=escape(for_terminal(label))))
 
 

@@ -21,7 +21,7 @@ from nerf_lightning.data.pixels.decoded_photographs import Photograph
 from nerf_lightning.data.pixels.picture_files import read_header
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.signatures import Signature
-from nerf_lightning.files.trust import shown
+from nerf_lightning.files.trust import for_message
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import require_printable
 from nerf_lightning.nerf.geometry.poses import flip_yz, is_rigid
@@ -209,7 +209,7 @@ def numbers(value: object, count: int, where: str) -> list[float]:
         pass
     wanted, is_ = (
         "a number" if count == 1 else f"{count} numbers",
-        "missing" if value is None else shown(" ".join(map(str, found))),
+        "missing" if value is None else for_message(" ".join(map(str, found))),
     )
     raise InputError(f"{where} must be {wanted}, but it is {is_}. {CURE}")
 

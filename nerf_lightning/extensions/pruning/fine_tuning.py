@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.commands.train import run as train
-from nerf_lightning.config.auto_settings import AUTO, settled
+from nerf_lightning.config.auto_settings import AUTO, chosen_numbers
 from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.error_messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
@@ -52,7 +52,7 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
     if begun.choices.get("model") == AUTO:  # the choices for the scene
         picked = {group: checkpoint.choices.get(group) for group in ("model", "loss")}
         former += [f"{group}={name}" for group, name in picked.items() if name in option_names(group)]
-        former += settled(plain_yaml(checkpoint.config, f"The config in {checkpoint.path}"))
+        former += chosen_numbers(plain_yaml(checkpoint.config, f"The config in {checkpoint.path}"))
         config = compose_config("train", former).config
     model = OmegaConf.to_container(config.model, resolve=False)
     return [*former, *dict.fromkeys(f"{_setting(model, name)}={width}" for name, width in widths.items())]

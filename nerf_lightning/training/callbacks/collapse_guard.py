@@ -54,7 +54,7 @@ class CollapseGuard(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Check regularly, and log a restart."""
         batches, optimizer = trainer.datamodule.batches, pl_module.optimizers().optimizer  # type: ignore[attr-defined]
-        message = self.look(pl_module.train_step, batches, optimizer, outputs["step"], trainer.global_step)
+        message = self.check(pl_module.train_step, batches, optimizer, outputs["step"], trainer.global_step)
         if message is None:
             return
         for logger in trainer.loggers:
@@ -62,7 +62,7 @@ class CollapseGuard(Callback):
         for writer in tensorboard_writers(trainer.loggers):
             writer.add_text("collapse_guard", message, trainer.global_step)
 
-    def look(self, train_step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
+    def check(self, train_step: Any, batches: Any, optimizer: Any, output: StepOutput, num_steps: int) -> str | None:
         """Check when it is time, and restart a run that has collapsed.
 
         Args:
@@ -115,15 +115,15 @@ def whole_batch(output: StepOutput) -> dict[str, torch.Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def is_constant(seen: dict[str, torch.Tensor], ratio: float) -> bool:
+def is_constant(batch: dict[str, torch.Tensor], ratio: float) -> bool:
     """Return whether the scene's own light is the same for all rays, unlike the photographs.
 
     Rays of masked pixels do not count: the field has not learned what is there.
     """
-    seen = {name: value.cpu() for name, value in seen.items()}
-    kept = seen["weight"] > 0
-    if int(kept.sum()) < 2:
+    batch = {name: value.cpu() for name, value in batch.items()}
+    mask = batch["weight"] > 0
+    if int(mask.sum()) < 2:
         return False
-    target_spread = seen["target"][kept].std(dim=0).amax()
-    render_spread = seen["foreground"][kept].std(dim=0).amax()
+    target_spread = batch["target"][mask].std(dim=0).amax()
+    render_spread = batch["foreground"][mask].std(dim=0).amax()
     return bool((target_spread > 1e-3) & (render_spread < ratio * target_spread))

@@ -35,16 +35,16 @@ def describe_run(loggers: list[Logger], config: DictConfig) -> None:
             writer._get_file_writer().add_summary(summary)
 
 
-def hyper_parameters(config: DictConfig, given: list[str]) -> dict[str, Any]:
+def hyper_parameters(config: DictConfig, overrides: list[str]) -> dict[str, Any]:
     """Return scene, model, seed and other settings in which runs may differ, as TensorBoard takes them.
 
     Args:
         config: all settings.
-        given: the overrides of the command line; all else has its default.
+        overrides: of the command line; all else has its default.
     """
     choices = HydraConfig.get().runtime.choices
     values = {"model": str(choices.get("model")), "scene": str(choices.get("scene")), "seed": config.get("seed")}
-    for key, _, text in (override.lstrip("+~").partition("=") for override in given):
+    for key, _, text in (override.lstrip("+~").partition("=") for override in overrides):
         if key not in values and _is_compared(key):
             value = OmegaConf.select(config, key, default=text)
             values[key] = value if isinstance(value, (bool, int, float, str)) else text
@@ -53,4 +53,4 @@ def hyper_parameters(config: DictConfig, given: list[str]) -> dict[str, Any]:
 
 def _is_compared(key: str) -> bool:
     meaning = meaning_of(key.partition("@")[0])
-    return meaning.shown and (meaning.identity or meaning.learnt) and not names_a_class(key)
+    return meaning.has_column and (meaning.identity or meaning.learnt) and not names_a_class(key)

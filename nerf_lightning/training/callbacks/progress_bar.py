@@ -33,7 +33,7 @@ class TrainingProgress(ProgressBar):
         self.silent = False
         self.task = TaskID(0)
         self.started: float | None = None
-        self.first_step, self.shown, self.rays_seen = 0, 0.0, 0
+        self.first_step, self.last_update, self.rays_seen = 0, 0.0, 0
 
     def disable(self) -> None:
         """Stay silent: Lightning calls this in every process but the first."""
@@ -50,37 +50,38 @@ class TrainingProgress(ProgressBar):
             BarColumn(bar_width=None),
             TextColumn("{task.description}"),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
+            TextColumn("{task.fields[remaining]}"),
             console=console,
             expand=True,
         )
-        self.task = self.bar.add_task("", total=None, step=f"{trainer.global_step:,}", left="")
+        self.task = self.bar.add_task("", total=None, step=f"{trainer.global_step:,}", remaining="")
         self.bar.start()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
         if self.started is None:  # the first step compiles kernels, and is not representative
-            self.started = self.shown = now
+            self.started = self.last_update = now
             self.first_step, self.rays_seen = step, pl_module.train_step.progress.rays_seen
             return
-        if self.silent or now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
+        if self.silent or now - self.last_update < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
+        rays_seen = pl_module.train_step.progress.rays_seen
         # Negative after a restart, which resets the count.
-        rays_per_second = max(0.0, (pl_module.train_step.progress.rays_seen - self.rays_seen) / (now - self.shown))
-        self.shown, self.rays_seen = now, pl_module.train_step.progress.rays_seen
+        rays_per_second = max(0.0, (rays_seen - self.rays_seen) / (now - self.last_update))
+        self.last_update, self.rays_seen = now, rays_seen
         output: StepOutput = outputs["step"]
         loss, quality = torch.stack([output.losses.sum(), psnr(output.color_errors[-1])]).tolist()
         text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
         total = _total(trainer, pl_module)
-        left = "" if total is None else self._left(step, total, now - self.started)
+        remaining = "" if total is None else self._remaining(step, total, now - self.started)
         where = f"{step}" if total is None else f"{step}/{total}"
         if self.bar is not None:
-            self.bar.update(self.task, completed=step, total=total, description=text, step=where, left=left)
+            self.bar.update(self.task, completed=step, total=total, description=text, step=where, remaining=remaining)
         else:
-            log.info("step %s  %s%s", where, text, left and f"  {left}")
+            log.info("step %s  %s%s", where, text, remaining and f"  {remaining}")
 
-    def _left(self, step: int, total: int, seconds: float) -> str:
+    def _remaining(self, step: int, total: int, seconds: float) -> str:
         """Return the time left after `seconds`, once enough of the run is over to estimate it."""
         done, asked = step - self.first_step, total - self.first_step
         return "" if done < max(1, FORESEEN_FROM * asked) else f"about {spoken((total - step) * seconds / done)} left"
@@ -89,7 +90,7 @@ class TrainingProgress(ProgressBar):
         """Do not count the last `seconds`: training was paused."""
         if self.started is not None:
             self.started += seconds
-        self.shown += seconds
+        self.last_update += seconds
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""
@@ -101,7 +102,7 @@ class TrainingProgress(ProgressBar):
 
     def _stop(self, step: int) -> None:
         if self.bar is not None:
-            self.bar.update(self.task, completed=step, total=step, step=f"{step:,}", left="")
+            self.bar.update(self.task, completed=step, total=step, step=f"{step:,}", remaining="")
             self.bar.stop()
             self.bar = None
 

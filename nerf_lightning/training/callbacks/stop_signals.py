@@ -27,11 +27,11 @@ class StopSignals(Callback):
         self.stop_file: Path | None = None
         """A file whose existence requests a stop, like SIGTERM, which on Windows would end the process at once."""
         self.heard = False  # a signal, not only the file
-        self.former: dict[int, Any] = {}
+        self.previous_handlers: dict[int, Any] = {}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remember the handlers from before Lightning's, which would keep a finished trainer alive and deaf."""
-        self.former = {number: signal.getsignal(number) for number in stop_signals()}
+        self.previous_handlers = {number: signal.getsignal(number) for number in stop_signals()}
 
     def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Listen."""
@@ -64,9 +64,9 @@ class StopSignals(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Restore the handlers."""
-        for number, handler in self.former.items():
+        for number, handler in self.previous_handlers.items():
             signal.signal(number, handler)
-        self.former.clear()
+        self.previous_handlers.clear()
 
     def _listen(self) -> None:
         for number in stop_signals():

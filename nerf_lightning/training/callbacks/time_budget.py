@@ -72,12 +72,12 @@ class TimeBudget(Callback):
             raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
         self.seconds, self.every_steps = seconds, every_steps
         self.used, self.first, self.since, self.compiles = 0.0, 0, 0.0, True
-        self.former: Any = None
+        self.previous_handler: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Install a handler that notices when the process continues; a resumed run knows how fast it was."""
         if hasattr(signal, "SIGCONT"):
-            self.former = signal.signal(signal.SIGCONT, self._woken)
+            self.previous_handler = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
             self._fit_schedule(trainer, pl_module.train_step)
         else:
@@ -101,9 +101,9 @@ class TimeBudget(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
         """Restore the handler."""
-        if self.former is not None:
-            signal.signal(signal.SIGCONT, self.former)
-            self.former = None
+        if self.previous_handler is not None:
+            signal.signal(signal.SIGCONT, self.previous_handler)
+            self.previous_handler = None
 
     def state_dict(self) -> dict[str, Any]:
         """Return the time used, for a resume."""

@@ -72,7 +72,7 @@ class _Recording:
     weight: Tensor
     key: Tensor
     replay: Callable[[], None]
-    seen: StepOutput
+    output: StepOutput
     gradients: list[Tensor | None]
 
 
@@ -135,7 +135,7 @@ class RecordedGradients:
         kept.replay()
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
-        return kept.seen
+        return kept.output
 
     def _recorded(self, batch: Batch, key: int, share: Share) -> _Recording:
         batch, weight = batch.map(Tensor.clone), share.weight.clone()

@@ -28,15 +28,15 @@ def preemptible() -> Iterator[None]:
         yield
         return
     listened = [number for number in stop_signals() if number != signal.SIGINT]
-    former = {number: signal.signal(number, _leave) for number in listened}
+    previous_handlers = {number: signal.signal(number, _leave) for number in listened}
     try:
         yield
     except SystemExit as stop:
         if wants_restart(stop.code):
-            _restart(int(stop.code or 0) - OF_SIGNALS, former)
+            _restart(int(stop.code or 0) - OF_SIGNALS, previous_handlers)
         raise
     finally:
-        for number, handler in former.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
@@ -50,8 +50,8 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
     raise SystemExit(OF_SIGNALS + number)
 
 
-def _restart(number: int, former: dict[int, Any]) -> None:
-    handler = former.get(number)
+def _restart(number: int, previous_handlers: dict[int, Any]) -> None:
+    handler = previous_handlers.get(number)
     if number == submitit_signal() and callable(handler):
         handler(number, None)
     elif "SUBMITIT_EXECUTOR" not in os.environ:
