@@ -60,7 +60,7 @@ def main() -> int:
     spent, views, false = 0.0, 0, 0
     for kind, drawn, scene in captures(seeds):
         began = time.process_time()
-        evidence, checks = examine(scene)
+        analysis, checks = examine(scene)
         spent, views = spent + time.process_time() - began, views + len(scene.view_names)
         examined[kind] += 1
         for check in checks:
@@ -70,7 +70,7 @@ def main() -> int:
                 print(f"wrong on exact poses: {scene.name}: {check.name}: {check.message}", flush=True)
         for fault in FAULTS:
             times = drawn if fault.startswith(("one", "two")) else min(drawn, 1)
-            found += [(kind, plant(evidence, fault, seed)) for seed in range(times)]
+            found += [(kind, plant(analysis, fault, seed)) for seed in range(times)]
     print_false_alarms(alarms, examined)
     print_found(found)
     print(f"\n{sum(examined.values())} captures, {1000 * spent / views:.0f} ms of processor time a view")

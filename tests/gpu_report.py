@@ -63,7 +63,7 @@ def step_and_tile(model: str, device: torch.device, precision: str) -> None:
     quick = [each for each in small(model) if re.search("resolution|data.batch_rays", each)]
     run = step_by_step(model, device, precision, None, *(each for each in quick if "encoder" not in each))
     run.step()
-    rays = run.training.objective.rays(run.loader.at(0, 0).pixels)
+    rays = run.training.objective.rays(run.loader.batch_at(0, 0).pixels)
     with torch.no_grad():
         run.training.objective.model.eval()(rays, torch.ones_like(rays.origins), None)
 

@@ -37,11 +37,11 @@ def run(config: DictConfig) -> int:
     about = about_capture(scene, *_origin(config, reader))
     default = child_of(Path(config.paths.root_dir), scene.name, f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}")
     folder = output_folder(config.paths.output_dir, default)
-    evidence, checks = examine(scene)
+    analysis, checks = examine(scene)
     rows = [{key: getattr(check, key) for key in ("name", "verdict", "message", "cure")} for check in checks]
     result = {"scene": scene.name, "capture": about, "checks": rows}
     write_json(folder / "doctor.json", result)
-    save_png(folder / "doctor.png", doctor_picture(evidence, checks, about))
+    save_png(folder / "doctor.png", doctor_picture(analysis, checks, about))
     written = [folder / "doctor.json", folder / "doctor.png"]
     proofs = [proof for check in checks for proof in check.proofs]
     if proofs:

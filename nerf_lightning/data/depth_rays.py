@@ -45,7 +45,7 @@ class DepthRays:
             y=(y[:, None] + down).flatten(),
         )
 
-    def told(self, batch: Batch, number: Int[Tensor, "squares"]) -> Batch:
+    def with_depths(self, batch: Batch, number: Int[Tensor, "squares"]) -> Batch:
         """Return a batch with the distances of its last squares, from `locate`; its other rays have no certainty."""
         known, size = self.depths[number], self.patch**2
         distance, certainty = torch.ones_like(batch.weight), torch.zeros_like(batch.weight)

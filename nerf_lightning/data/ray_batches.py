@@ -174,17 +174,17 @@ class RayBatches:
         device, progress = self.prefetch_for, self.progress
         if device is None:
             while True:
-                yield self.at(progress.attempt, progress.rays_seen)
+                yield self.batch_at(progress.attempt, progress.rays_seen)
 
-        def make(*place: int) -> Batch:
-            batch = self.at(*place)
+        def make(*position: int) -> Batch:
+            batch = self.batch_at(*position)
             return batch.map(Tensor.pin_memory) if device.type == "cuda" else batch
 
         for batch in made_ahead(make, lambda: (progress.attempt, progress.rays_seen, progress.batch_rays)):
             yield batch.to(device, non_blocking=device.type == "cuda")
 
     @torch_on_one_thread()
-    def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
+    def batch_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch after `rays_seen` rays of an attempt; `batch_rays` of None: the current batch size."""
         if self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device):
             return self._in_one_kernel(attempt, rays_seen, batch_rays)
@@ -192,7 +192,7 @@ class RayBatches:
         batch = gather_batch(self.scene, pixels)
         if self.depths is None:
             return batch
-        return self.depths.told(batch, self._depths_at(attempt, rays_seen, batch_rays))
+        return self.depths.with_depths(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
     def _in_one_kernel(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
         domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
@@ -328,28 +328,28 @@ class WholeViews:
         return (gather_batch(self.scene, all_pixels(self.scene.cameras, view)) for view in self.views)
 
 
-Place = tuple[int, int, int]
+Position = tuple[int, int, int]
 """Attempt, rays seen in it, and rays of the batch: all that a batch depends on, besides the config."""
 
 
-def made_ahead(make: Callable[[int, int, int], Batch], current: Callable[[], Place]) -> Iterator[Batch]:
-    """Yield the batch of the current place, again and again, each made while the previous step runs.
+def made_ahead(make: Callable[[int, int, int], Batch], current: Callable[[], Position]) -> Iterator[Batch]:
+    """Yield the batch of the current position, again and again, each made while the previous step runs.
 
     The thread makes the batch that follows if the run proceeds normally. If it does not (a restart, another batch
     size), that batch is dropped, and the requested one is made on the spot: which rays follow is a function of the
-    place alone, with or without this thread.
+    position alone, with or without this thread.
 
     Args:
-        make: takes a place; called in both threads, possibly at once.
-        current: the run's place.
+        make: takes a position; called in both threads, possibly at once.
+        current: the run's position.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
-        guess: Place | None = None
+        guess: Position | None = None
         made: Future[Batch] | None = None
         while True:
-            place = current()
-            batch = made.result() if made is not None and place == guess else make(*place)
-            attempt, rays_seen, batch_rays = place
+            position = current()
+            batch = made.result() if made is not None and position == guess else make(*position)
+            attempt, rays_seen, batch_rays = position
             guess = (attempt, rays_seen + batch_rays, batch_rays)
             made = pool.submit(make, *guess)
             yield batch

@@ -8,7 +8,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.data.captures.left_out import ALL_CAMERAS
-from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, Given, look, not_judged, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import (
+    MORE_DETAILS,
+    Analysis,
+    CaptureData,
+    Check,
+    look,
+    not_judged,
+    ok,
+    rows_at_once,
+    wrong,
+)
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.messages.escaping import listed
@@ -30,13 +40,13 @@ CLEARLY_MORE = 0.05  # Share of the matched details that exceeds chance.
 SOUND = 0.5  # Share of matched details that agree with the cameras, from which on the axes are right.
 
 
-def rigid(evidence: Given) -> Check:
+def rigid(data: CaptureData) -> Check:
     """Judge whether poses are rotations (no scale, no mirror), and all cameras are distinct."""
-    c2w = evidence.scene.cameras.c2w
+    c2w = data.scene.cameras.c2w
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
     if bad:
         cure = "Take scale and mirror out of the rotations; the centers keep them."
-        return wrong(f"{evidence.named(bad)} have poses that are not rotations", cure)
+        return wrong(f"{data.named(bad)} have poses that are not rotations", cure)
     size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
         cure = "Walk around: depth is seen only from different places. Or the centers were lost in the conversion."
@@ -48,12 +58,12 @@ def rigid(evidence: Given) -> Check:
     return ok(f"all {len(c2w)} poses are right-handed rotations with different centers")
 
 
-def common_middle(evidence: Given) -> Check:
+def common_middle(data: CaptureData) -> Check:
     """Judge whether the cameras look at, or away from, the point where their axes meet."""
-    c2w = evidence.scene.cameras.c2w.double()
-    if evidence.scene.cameras.lens_model == "equirectangular":
+    c2w = data.scene.cameras.c2w.double()
+    if data.scene.cameras.lens_model == "equirectangular":
         return not_judged("panoramas look everywhere", "See the check of axes.")
-    if evidence.scene.space == "ndc" or bool((c2w[:, :, 2].mean(dim=0).norm() > 0.95).item()):
+    if data.scene.space == "ndc" or bool((c2w[:, :, 2].mean(dim=0).norm() > 0.95).item()):
         return not_judged("the cameras all look the same way", "See the check of axes.")
     to_middle = focus_point(c2w) - c2w[:, :, 3]
     ahead = float(((to_middle * -c2w[:, :, 2]).sum(dim=-1) > 0).double().mean())
@@ -65,25 +75,25 @@ def common_middle(evidence: Given) -> Check:
             "look outward from one position, the poses are right."
         )
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from their common focus point"
-        if isinstance(evidence, Evidence) and evidence.agreement >= SOUND:
+        if isinstance(data, Analysis) and data.agreement >= SOUND:
             return look(f"{message}, and the photographs agree with the poses", "Nothing, if they look outward.")
         # A box contains what all cameras look at.
-        if isinstance(evidence, Evidence) and evidence.scene.space != "bounded" and not _fits_opencv(evidence):
+        if isinstance(data, Analysis) and data.scene.space != "bounded" and not _fits_opencv(data):
             return look(f"{message}, and the photographs do not tell whether that is right", cure)
         return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
     cure = "See doctor.png: the cameras should face what was photographed. If not, see the check of axes."
     return look(f"only {100 * ahead:.0f} % of the cameras face a common focus point", cure)
 
 
-def _fits_opencv(evidence: Evidence) -> bool:
+def _fits_opencv(analysis: Analysis) -> bool:
     """Return whether clearly more of the matched details agree with the cameras if their axes are OpenCV's."""
-    flipped = agreeing(evidence.matches, axes(evidence.scene.cameras.c2w, FLIP_YZ))
-    return int(flipped.sum()) - int(evidence.agrees.sum()) > CLEARLY_MORE * len(flipped)
+    flipped = agreeing(analysis.matches, axes(analysis.scene.cameras.c2w, FLIP_YZ))
+    return int(flipped.sum()) - int(analysis.agrees.sum()) > CLEARLY_MORE * len(flipped)
 
 
-def upright(evidence: Given) -> Check:
+def upright(data: CaptureData) -> Check:
     """Judge whether the photographs are sideways or upside down in the working frame."""
-    scene = evidence.scene
+    scene = data.scene
     up = torch.tensor([0.0, 1.0, 0.0] if scene.space == "ndc" else [0.0, 0.0, 1.0])
     right_up, up_up = (up @ scene.cameras.c2w[:, :, column].T for column in (0, 1))
     sideways = float((right_up.abs() > 0.7).float().mean())
@@ -96,9 +106,9 @@ def upright(evidence: Given) -> Check:
     return ok("the photographs are upright")
 
 
-def field_of_view(evidence: Given) -> Check:
+def field_of_view(data: CaptureData) -> Check:
     """Judge the focal lengths by the field of view, and by how much they vary."""
-    cameras = evidence.scene.cameras
+    cameras = data.scene.cameras
     if cameras.lens_model == "equirectangular":
         return ok("panoramas: all directions")
     side = torch.maximum(cameras.width, cameras.height)
@@ -117,9 +127,9 @@ def field_of_view(evidence: Given) -> Check:
     return ok(message)
 
 
-def principal_point(evidence: Given) -> Check:
+def principal_point(data: CaptureData) -> Check:
     """Judge how far the principal point is from the photograph's center; report a halved one."""
-    cameras = evidence.scene.cameras
+    cameras = data.scene.cameras
     size = torch.stack([cameras.width, cameras.height], dim=-1)
     share = cameras.center / size
     off = float((share - 0.5).abs().max())
@@ -136,9 +146,9 @@ def principal_point(evidence: Given) -> Check:
     return (wrong if is_other_size else look)(message, cure)
 
 
-def lens(evidence: Given) -> Check:
+def lens(data: CaptureData) -> Check:
     """Judge how strongly the lens distorts toward the corners; one that folds is refused when the capture is read."""
-    cameras = evidence.scene.cameras
+    cameras = data.scene.cameras
     if cameras.lens_model == "pinhole" or not bool(cameras.lens.any()):
         return ok("no distortion")
     view = int(cameras.lens.abs().sum(dim=-1).argmax())
@@ -154,66 +164,66 @@ def lens(evidence: Given) -> Check:
     return ok(message)
 
 
-def number_of_views(evidence: Given) -> Check:
+def number_of_views(data: CaptureData) -> Check:
     """Judge whether there are enough views to learn from."""
-    splits = evidence.scene.splits
+    splits = data.scene.splits
     count = len(splits["train"])
     held = len(set(splits["val"]) | set(splits["test"]))
     message = f"{count} for training, {held} held out"
     if count >= FEW:
         return ok(message)
-    if (missing := len(evidence.scene.left_out)) > count + held:
+    if (missing := len(data.scene.left_out)) > count + held:
         message = f"{message}, and {missing} that are left out"
         return (wrong if count < TOO_FEW else look)(message, ALL_CAMERAS)
     cure = "Take more photographs: 15 or more of a scene seen from the front, 50 to 100 all around."
     return (wrong if count < TOO_FEW else look)(message, cure)
 
 
-def splits(evidence: Evidence) -> Check:
+def splits(analysis: Analysis) -> Check:
     """Judge whether views are held out, and not trained on as well."""
-    parts = {split: set(views) for split, views in evidence.scene.splits.items()}
+    parts = {split: set(views) for split, views in analysis.scene.splits.items()}
     both = sorted(parts["train"] & (parts["val"] | parts["test"]))
     if both:
         cure = "Remove them from one of the two lists; otherwise scores say nothing about new views."
-        return wrong(f"{evidence.named(both)} are both trained on and held out", cure)
+        return wrong(f"{analysis.named(both)} are both trained on and held out", cure)
     held = sorted(parts["val"] | parts["test"])
-    angles = _degrees_to_nearest(evidence.scene, held, sorted(parts["train"]))
+    angles = _degrees_to_nearest(analysis.scene, held, sorted(parts["train"]))
     lonely = [view for view, angle in zip(held, angles.tolist(), strict=True) if angle > FAR_HELD_OUT]
     if lonely:
-        message = f"{evidence.named(lonely)} are more than {FAR_HELD_OUT:.0f} degrees away from any training view"
+        message = f"{analysis.named(lonely)} are more than {FAR_HELD_OUT:.0f} degrees away from any training view"
         return look(message, "Expect low scores there; hold out other views, or add photographs.")
     far = f"; the farthest lies {float(angles.max()):.0f} degrees from a training view" if len(held) else ""
     return ok(f"no view is both in training and held out{far}")
 
 
-def left_out(evidence: Evidence) -> Check:
+def left_out(analysis: Analysis) -> Check:
     """Report photographs without a pose."""
-    missing = evidence.scene.left_out
+    missing = analysis.scene.left_out
     if not missing:
         return ok("none")
-    total = len(missing) + len(evidence.scene.view_names)
+    total = len(missing) + len(analysis.scene.view_names)
     message = f"{len(missing)} of {total} photographs have no pose: {listed(missing, cap=5)}"
     cure = "If they are needed, take photographs between them and the others and estimate the poses again (nerf poses)."
     return look(message, cure)
 
 
-def overlap(evidence: Evidence) -> Check:
+def overlap(analysis: Analysis) -> Check:
     """Find views that share almost nothing with others."""
-    matches = evidence.matches
-    total = len(evidence.scene.view_names)
+    matches = analysis.matches
+    total = len(analysis.scene.view_names)
     counts = torch.bincount(matches.view.flatten(), minlength=total)[list(matches.views)]
     if not len(matches.view) or int(counts.median()) < 2 * FEW_MATCHES:
         return not_judged("too few details could be found again", MORE_DETAILS)
     lonely = [matches.views[place] for place in (counts < FEW_MATCHES).nonzero()[:, 0].tolist()]
     if not lonely:
         return ok(f"every view shares at least {int(counts.min())} details with others")
-    message = f"{evidence.named(lonely)} share next to nothing with other views"
+    message = f"{analysis.named(lonely)} share next to nothing with other views"
     return look(message, "Add photographs between these and the others, or leave these out.")
 
 
-def coverage(evidence: Evidence) -> Check:
+def coverage(analysis: Analysis) -> Check:
     """Report from where around the center photographs were taken, and any gap in a ring of views."""
-    scene = evidence.scene
+    scene = analysis.scene
     if scene.space == "ndc":
         return ok("forward-facing: new views are good between the cameras, not outside them")
     azimuth, elevation = directions_seen(scene)

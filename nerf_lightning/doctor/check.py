@@ -1,4 +1,4 @@
-"""The outcome of a check, and its evidence."""
+"""The outcome of a check, and the data that it judges."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Given:
+class CaptureData:
     """The capture's own data, before any pixel is read."""
 
     scene: Scene
@@ -45,7 +45,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Evidence(Given):
+class Analysis(CaptureData):
     """Everything that checks use."""
 
     looks: Looks
@@ -63,7 +63,7 @@ class Evidence(Given):
         return float(self.agrees.float().mean()) if len(self.agrees) else 0.0
 
 
-CheckFn = Callable[[Evidence], Check]
+CheckFn = Callable[[Analysis], Check]
 ok, look, wrong = partial(Check, "", "ok"), partial(Check, "", "look"), partial(Check, "", "wrong")
 not_judged = partial(Check, "", "not judged")
 """Results of checks: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`, or, with too little

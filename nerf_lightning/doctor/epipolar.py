@@ -25,10 +25,10 @@ def line_distances(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: floa
     With D, E the rays and b the vector between the centers, the plane of b and E intersects the other picture in a line
     (the epipolar line). Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9. Arguments as in `agreeing`.
     """
-    rays, between = rays_of(matches, c2w, zoom)
+    rays, baseline = rays_of(matches, c2w, zoom)
     off = []
     for here, there in ((0, 1), (1, 0)):
-        normal = functional.normalize(torch.linalg.cross(between, rays[:, there]), dim=-1)
+        normal = functional.normalize(torch.linalg.cross(baseline, rays[:, there]), dim=-1)
         # The line in the axes of the picture: its first two components are in the picture's plane.
         right, up, back = c2w[matches.view[:, here], :, :3].double().unbind(dim=-1)
         slope = ((normal * right).sum(dim=-1).square() + (normal * up).sum(dim=-1).square()).sqrt()
@@ -48,9 +48,9 @@ def distances(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor
 
 def places(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 3"]:
     """Return the world position of each match, on the first ray (scene units)."""
-    rays, between = rays_of(matches, c2w)
+    rays, baseline = rays_of(matches, c2w)
     first = c2w[matches.view[:, 0], :, 3].double()
-    return (first + _nearest(rays, between)[:, :1] * rays[:, 0]).float()
+    return (first + _nearest(rays, baseline)[:, :1] * rays[:, 0]).float()
 
 
 def parallax(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches"]:
@@ -71,10 +71,10 @@ def rays_of(
     return rays, poses[:, 1, :, 3] - poses[:, 0, :, 3]
 
 
-def _nearest(rays: Float[Tensor, "matches 2 3"], between: Float[Tensor, "matches 3"]) -> Float[Tensor, "matches 2"]:
-    # s, t that minimize |s first - t second - between|.
+def _nearest(rays: Float[Tensor, "matches 2 3"], baseline: Float[Tensor, "matches 3"]) -> Float[Tensor, "matches 2"]:
+    # s, t that minimize |s first - t second - baseline|.
     first, second = rays.unbind(dim=1)
     cosine = (first * second).sum(dim=-1)
-    along, across = (first * between).sum(dim=-1), (second * between).sum(dim=-1)
+    along, across = (first * baseline).sum(dim=-1), (second * baseline).sum(dim=-1)
     sine = (1.0 - cosine.square()).clamp(min=1e-12)
     return torch.stack([along - cosine * across, cosine * along - across], dim=-1) / sine[:, None]

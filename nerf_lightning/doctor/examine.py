@@ -1,4 +1,4 @@
-"""All checks of a capture, and their evidence. A new check is a function, listed in CHECKS of its file."""
+"""Analyze a capture, and judge it by all checks. A new check is a function, listed in CHECKS of its file."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 from nerf_lightning.compute.machine import torch_threads
 from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.doctor import cameras, extent, image_quality, poses
-from nerf_lightning.doctor.check import Check, CheckFn, Evidence
+from nerf_lightning.doctor.check import Analysis, Check, CheckFn
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, Looks, find_corners, look_at_view, shrunk_cameras, small_picture
 from nerf_lightning.doctor.matches import likely_pairs, matched_pairs
@@ -28,8 +28,8 @@ FIRST_ADVICE = ("coverage", "photographs without pose", "number of views", "over
 """Checks whose cures are worth most: nothing compensates for missing photographs."""
 
 
-def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
-    """Return the evidence, and the outcome of every check; takes seconds."""
+def examine(scene: Scene) -> tuple[Analysis, list[Check]]:
+    """Return the analysis, and the outcome of every check; takes seconds."""
     if scene.capture_of is not None:
         raise InputError(
             f"{scene.name} joins {len(scene.captures)} captures, and the doctor examines one at a time: give "
@@ -37,8 +37,8 @@ def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
         )
     # Pictures are distributed over our own threads; torch's would only get in their way.
     with torch_threads(1):
-        evidence = gather_evidence(scene)
-        return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
+        analysis = analyze(scene)
+        return analysis, [replace(check(analysis), name=name) for name, check in CHECKS.items()]
 
 
 def advice(checks: Sequence[Check]) -> str | None:
@@ -52,20 +52,20 @@ MOST_COMPARED = 160
 NOTICEABLE = 30
 
 
-def gather_evidence(scene: Scene) -> Evidence:
+def analyze(scene: Scene) -> Analysis:
     """Return what the checks need to know about a scene; takes seconds."""
     total = len(scene.view_names)
     compared = {total * number // min(total, MOST_COMPARED) for number in range(min(total, MOST_COMPARED))}
     cameras = shrunk_cameras(scene.cameras)
     corners: dict[int, Corners] = {}
 
-    def look(view: int) -> tuple[torch.Tensor, ...]:
+    def row_of(view: int) -> tuple[torch.Tensor, ...]:
         picture = small_picture(scene.pixels, view, int(cameras.width[view]), int(cameras.height[view]))
         if view in compared:
             corners[view] = find_corners(picture)
         return look_at_view(scene.pixels, view, picture)
 
-    rows = in_threads(look, total, "Looking at photographs", shown=total > NOTICEABLE)
-    matches = matched_pairs(cameras, corners, likely_pairs(corners), shown=total > NOTICEABLE)
+    rows = in_threads(row_of, total, "Looking at photographs", visible=total > NOTICEABLE)
+    matches = matched_pairs(cameras, corners, likely_pairs(corners), visible=total > NOTICEABLE)
     looks = Looks(*(torch.stack(column) for column in zip(*rows, strict=True)))
-    return Evidence(scene, looks, matches, agreeing(matches, scene.cameras.c2w), corners)
+    return Analysis(scene, looks, matches, agreeing(matches, scene.cameras.c2w), corners)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Analysis, Check, look, not_judged, ok, wrong
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels, seen_at
@@ -25,10 +25,10 @@ MOST_POINTS, MOST_VIEWS = 5000, 200
 UNITS = {"inches": 39.37, "feet": 3.281, "centimeters": 100.0, "millimeters": 1000.0}
 
 
-def near_and_far(evidence: Evidence) -> Check:
+def near_and_far(analysis: Analysis) -> Check:
     """Judge whether content is between near and far."""
-    scene = evidence.scene
-    found = content_distances(evidence)
+    scene = analysis.scene
+    found = content_distances(analysis)
     if found is None:
         return not_judged("no sparse points, and too few details were found again", MORE_DETAILS)
     view, distance = found
@@ -55,14 +55,14 @@ def near_and_far(evidence: Evidence) -> Check:
     return (wrong if serious else look)(f"{message}: {cut}", cure)
 
 
-def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "content"]] | None:
+def content_distances(analysis: Analysis) -> tuple[Tensor, Float[Tensor, "content"]] | None:
     """Return views and distances of the content that they show (scene units; in NDC: depth before warping).
 
     From matched details, or if these are few, from the known distances or the sparse points.
     """
-    scene, matches = evidence.scene, evidence.matches
-    good = clear_matches(evidence)
-    if int(good.sum()) >= FEWEST and evidence.agreement > 0.3:
+    scene, matches = analysis.scene, analysis.matches
+    good = clear_matches(analysis)
+    if int(good.sum()) >= FEWEST and analysis.agreement > 0.3:
         if scene.space == "ndc":
             return matches.view[good, 0], -places(matches, scene.cameras.c2w)[good, 2]
         return matches.view[good].flatten(), distances(matches, scene.cameras.c2w)[good].flatten()
@@ -86,14 +86,14 @@ def _in_pictures(scene: Scene) -> tuple[Tensor, Float[Tensor, "content"]] | None
     return (torch.cat(views), distance) if len(distance) >= FEWEST else None
 
 
-def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
+def clear_matches(analysis: Analysis) -> Bool[Tensor, "matches"]:
     """Return which matches determine their world position."""
-    return evidence.agrees & (parallax(evidence.matches, evidence.scene.cameras.c2w) > LEAST_PARALLAX)
+    return analysis.agrees & (parallax(analysis.matches, analysis.scene.cameras.c2w) > LEAST_PARALLAX)
 
 
-def box_in_view(evidence: Evidence) -> Check:
+def box_in_view(analysis: Analysis) -> Check:
     """Judge whether every view's rays meet the modeled box between near and far."""
-    scene = evidence.scene
+    scene = analysis.scene
     if scene.space != "bounded":
         return ok(f"space is {scene.space}: no box bounds the content")
     shares = torch.stack([_share_in_box(scene, view) for view in range(len(scene.view_names))])
@@ -105,13 +105,13 @@ def box_in_view(evidence: Evidence) -> Check:
         "The cameras do not look at the box, or near and far miss it: check the axes of the poses, center the capture "
         "on its content, or set near, far and the box (scene.aabb_half)."
     )
-    message += f"; {len(blind)} views miss it, such as {evidence.named(blind[:3])}"
+    message += f"; {len(blind)} views miss it, such as {analysis.named(blind[:3])}"
     return (wrong if len(blind) > 0.3 * len(shares) else look)(message, cure)
 
 
-def scale(evidence: Evidence) -> Check:
+def scale(analysis: Analysis) -> Check:
     """Judge the size of the capture against what is modeled."""
-    scene = evidence.scene
+    scene = analysis.scene
     centers = scene.cameras.c2w[:, :, 3]
     middle = scene.aabb.mean(dim=0)
     away = float((centers - middle).norm(dim=-1).median())
@@ -126,15 +126,15 @@ def scale(evidence: Evidence) -> Check:
     if away > 30 * half:
         cure = "Scale the camera centers down, or make the box larger (scene.aabb_half), with near and far to match."
         return wrong(message + ": the content would be a dot in their pictures", cure)
-    return _content_in_box(evidence, message)
+    return _content_in_box(analysis, message)
 
 
-def _content_in_box(evidence: Evidence, message: str) -> Check:
-    scene = evidence.scene
-    good = clear_matches(evidence)
+def _content_in_box(analysis: Analysis, message: str) -> Check:
+    scene = analysis.scene
+    good = clear_matches(analysis)
     if int(good.sum()) < FEWEST:
         return ok(message)
-    found = places(evidence.matches, scene.cameras.c2w)[good]
+    found = places(analysis.matches, scene.cameras.c2w)[good]
     inside = float(((found > scene.aabb[0]) & (found < scene.aabb[1])).all(dim=-1).float().mean())
     message += f"; {100 * inside:.0f} % of the matched details lie in it"
     if inside > 1 - MANY:

@@ -36,8 +36,8 @@ LEAST_SLOPE, LEAST_TEXTURE = 0.002, 150
 class Corners:
     """The corners of one picture, the clearest first."""
 
-    at: Float[Tensor, "corners 2"]
-    """x and y in pixels of the shrunk picture; pixel centers at +0.5."""
+    xy: Float[Tensor, "corners 2"]
+    """In pixels of the shrunk picture; pixel centers at +0.5."""
     descriptor: Float[Tensor, "corners dims"]
     """Unit length."""
     rgb: Float[Tensor, "corners 3"]
@@ -81,8 +81,8 @@ def find_corners(picture: Float[Tensor, "3 height width"], most: int = MOST_CORN
     x, y = index % grey.shape[1], index // grey.shape[1]
     # Subpixel position: the vertex of a parabola through the peak and its neighbors.
     shift = torch.stack([_top(*(clear[y, x + k] for k in (-1, 0, 1))), _top(*(clear[y + k, x] for k in (-1, 0, 1)))])
-    at = torch.stack([x, y], dim=-1) + 0.5 + shift.T
-    return Corners(at, _described(gx[0], gy[0], at), _blurred(picture, 2.0)[:, y, x].T)
+    positions = torch.stack([x, y], dim=-1) + 0.5 + shift.T
+    return Corners(positions, _described(gx[0], gy[0], positions), _blurred(picture, 2.0)[:, y, x].T)
 
 
 def _top(before: Float[Tensor, "corners"], here: Float[Tensor, "corners"], after: Float[Tensor, "corners"]) -> Tensor:
@@ -92,7 +92,7 @@ def _top(before: Float[Tensor, "corners"], here: Float[Tensor, "corners"], after
 
 def match(first: Corners, second: Corners) -> Int[Tensor, "matches 2"]:
     """Return pairs of mutually nearest corners that are clearly nearer than the next."""
-    if min(len(first.at), len(second.at)) < 2:
+    if min(len(first.xy), len(second.xy)) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
     similar = first.descriptor @ second.descriptor.T
     best, there = similar.topk(2, dim=1)
@@ -104,7 +104,7 @@ def match(first: Corners, second: Corners) -> Int[Tensor, "matches 2"]:
 
 
 def _described(
-    gx: Float[Tensor, "height width"], gy: Float[Tensor, "height width"], at: Float[Tensor, "corners 2"]
+    gx: Float[Tensor, "height width"], gy: Float[Tensor, "height width"], xy: Float[Tensor, "corners 2"]
 ) -> Float[Tensor, "corners dims"]:
     # Slopes in eight directions, blurred, at 4 x 4 places around the corner (as in DAISY and SIFT).
     angle = torch.arange(DIRECTIONS) * (2 * torch.pi / DIRECTIONS)
@@ -112,8 +112,8 @@ def _described(
     slopes = _blurred(slopes, 0.5 * SPACING)
     step = (torch.arange(PLACES) - 0.5 * (PLACES - 1)) * SPACING
     around = torch.cartesian_prod(step, step)
-    size = at.new_tensor([gx.shape[1], gx.shape[0]])
-    places = 2.0 * (at[:, None] + around) / size - 1.0
+    size = xy.new_tensor([gx.shape[1], gx.shape[0]])
+    places = 2.0 * (xy[:, None] + around) / size - 1.0
     seen = functional.grid_sample(slopes[None], places[None], align_corners=False)[0]
     flat = functional.normalize(seen.permute(1, 2, 0).flatten(1), dim=-1)
     return functional.normalize(flat.clamp(max=0.25), dim=-1)
@@ -151,7 +151,7 @@ class Looks:
     """Brightness; transparent or masked pixels are middle gray."""
     fineness: Float[Tensor, "views directions"]
     """Fineness of the detail, whatever its amount: see `fineness_of`."""
-    kept: Float[Tensor, "views"]
+    unmasked: Float[Tensor, "views"]
     """Share of the pixels that the mask keeps."""
     covered: Float[Tensor, "views"]
     """Mean alpha."""

@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.doctor import cameras
-from nerf_lightning.doctor.check import Check, Given
+from nerf_lightning.doctor.check import CaptureData, Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
-QUICK: dict[str, Callable[[Given], Check]] = {
+QUICK: dict[str, Callable[[CaptureData], Check]] = {
     "rotations": cameras.rigid,
     "camera directions": cameras.common_middle,
     "field of view": cameras.field_of_view,
@@ -57,7 +57,7 @@ def exposure_finding(checks: list[Check] | None) -> str | None:
 def warn_of_faults(scene: Scene) -> None:
     """Warn about faults of a scene that are found instantly, whether the doctor is enabled or not."""
     train = scene.splits["train"]
-    found = in_threads(lambda number: _nothing(scene.pixels, train[number]), len(train), "Looking", shown=False)
+    found = in_threads(lambda number: _nothing(scene.pixels, train[number]), len(train), "Looking", visible=False)
     blank = [f"{scene.view_names[view]} ({what})" for view, what in zip(train, found, strict=True) if what]
     if blank:
         alpha = ", whether alpha was exported (0 is transparent)" if scene.pixels.has_transparency else ""
@@ -67,7 +67,7 @@ def warn_of_faults(scene: Scene) -> None:
             *(len(blank), len(train), scene.name, listed(blank, cap=5), alpha, masks),
         )
     for name, judge in QUICK.items() if scene.capture_of is None else ():
-        check = judge(Given(scene))
+        check = judge(CaptureData(scene))
         if check.verdict == "wrong":
             log.warning("%s: %s. %s", name, check.message, check.cure)
 

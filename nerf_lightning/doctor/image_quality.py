@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Analysis, Check, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.doctor.features import THUMBNAIL
 from nerf_lightning.doctor.matches import Matches, nearest_views
 from nerf_lightning.nerf.rendering.background import at_evaluation
@@ -29,19 +29,19 @@ EVEN = 0.97
 COLOURS = {"white": 1.0, "black": 0.0}
 
 
-def duplicates(evidence: Evidence) -> Check:
+def duplicates(analysis: Analysis) -> Check:
     """Find duplicate photographs."""
-    flat = evidence.looks.thumbnail.flatten(1)
+    flat = analysis.looks.thumbnail.flatten(1)
     flat = flat - flat.mean(dim=1, keepdim=True)
     contrast = flat.std(dim=1)
     parts = torch.arange(len(flat)).split(rows_at_once(len(flat)))
     same = torch.cat([_pairs_alike(flat, contrast, part) for part in parts])
     if not len(same):
         return ok("no duplicate photographs")
-    scene = evidence.scene
+    scene = analysis.scene
     held = set(scene.splits["test"]) | set(scene.splits["val"])
     leak = [pair for pair in same.tolist() if (pair[0] in held) != (pair[1] in held)]
-    pairs = " and ".join(evidence.named([view]) for view in same[0].tolist())
+    pairs = " and ".join(analysis.named([view]) for view in same[0].tolist())
     message = f"{len(same)} pairs of photographs are all but identical, such as {pairs}"
     if leak:
         message += f"; {len(leak)} of them are both in training and held out, so scores will be too good"
@@ -58,15 +58,15 @@ def _pairs_alike(
     return torch.stack([rows[pairs[:, 0]], pairs[:, 1]], dim=1)
 
 
-def blur(evidence: Evidence) -> Check:
+def blur(analysis: Analysis) -> Check:
     """Find photographs that are much less sharp, along any direction, than those nearby."""
-    fineness = evidence.looks.fineness
+    fineness = analysis.looks.fineness
     shown = (~fineness.isnan().any(dim=1)).nonzero()[:, 0]
     if len(shown) <= FEWEST_NEIGHBORS or 2 * len(shown) < len(fineness):
         message = f"only {len(shown)} of {len(fineness)} photographs show enough texture"
         return not_judged(message, "It needs photographs in which the content is larger, or more of them.")
     parts = shown.split(rows_at_once(len(shown)))
-    near = torch.cat([nearest_views(evidence.scene.cameras.c2w, part, shown, NEIGHBORS) for part in parts])
+    near = torch.cat([nearest_views(analysis.scene.cameras.c2w, part, shown, NEIGHBORS) for part in parts])
     off = fineness[shown] - fineness[near].median(dim=1).values
     limit = min(max(math.exp(-DEVIATIONS * 1.48 * float(off.abs().median())), SOFTEST), SOFT)
     share = off.amin(dim=1).exp()
@@ -74,19 +74,19 @@ def blur(evidence: Evidence) -> Check:
     bad = shown[order[share[order] < limit]].tolist()
     least = f"{100 * float(share.min()):.0f} % of the fine detail of photographs from nearby"
     if hidden := fineness.isnan().any(dim=1).nonzero()[:, 0].tolist():
-        least += f" ({evidence.named(hidden)} show too little texture to tell)"
+        least += f" ({analysis.named(hidden)} show too little texture to tell)"
     if not bad:
         return ok(f"the least sharp of {len(shown)} photographs has {least}")
-    message = f"{len(bad)} of {len(shown)} are blurred: {evidence.named(bad)}; the worst has {least}"
+    message = f"{len(bad)} of {len(shown)} are blurred: {analysis.named(bad)}; the worst has {least}"
     return look(message, "Remove them (scene.frames, or from the file), or photograph again.")
 
 
-def exposure(evidence: Evidence) -> Check:
+def exposure(analysis: Analysis) -> Check:
     """Compare the colors of the same details in different photographs."""
-    matches = evidence.matches
-    if evidence.agreement > 0.3:
-        matches = matches.where(evidence.agrees)
-    gains = gains_of(matches, len(evidence.scene.view_names))
+    matches = analysis.matches
+    if analysis.agreement > 0.3:
+        matches = matches.where(analysis.agrees)
+    gains = gains_of(matches, len(analysis.scene.view_names))
     if gains is None:
         return not_judged("too few details could be found again", MORE_DETAILS)
     bright = gains.mean(dim=1).exp()
@@ -97,9 +97,9 @@ def exposure(evidence: Evidence) -> Check:
         return ok(f"brightness of the same details differs by a factor of at most {spread:.2f}")
     words = []
     if dark:
-        words.append(f"{evidence.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")
+        words.append(f"{analysis.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")
     if odd:
-        words.append(f"{evidence.named(odd)} differ in white balance")
+        words.append(f"{analysis.named(odd)} differ in white balance")
     cure = "correction=exposure learns these differences; photographs with fixed exposure and white balance are better."
     return look("; ".join(words), cure)
 
@@ -125,15 +125,15 @@ def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | Non
     return gains - gains.median(dim=0).values
 
 
-def transparency(evidence: Evidence) -> Check:
+def transparency(analysis: Analysis) -> Check:
     """Judge alpha, and whether colors are already premultiplied."""
-    scene, looks = evidence.scene, evidence.looks
+    scene, looks = analysis.scene, analysis.looks
     if not scene.pixels.has_transparency:
         return ok("the photographs are opaque")
     covered = f"{100 * float(looks.covered.mean()):.0f} % of the pixels show the content"
     empty = (looks.covered < 0.003).nonzero()[:, 0].tolist()
     if empty:
-        message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
+        message = f"{analysis.named(empty)} show (almost) nothing: all is transparent"
         return look(message, "See that alpha was exported, or remove these views.")
     up_to, beyond = looks.faint.sum(dim=0).tolist()
     # Cutting out does not change colors.
@@ -147,9 +147,9 @@ def transparency(evidence: Evidence) -> Check:
     return ok(f"{covered}, the rest is transparent")
 
 
-def baked_background(evidence: Evidence) -> Check:
+def baked_background(analysis: Analysis) -> Check:
     """Find a background of one color that opaque photographs have, or had, baked in."""
-    scene, looks = evidence.scene, evidence.looks
+    scene, looks = analysis.scene, analysis.looks
     if color := scene.protocol.get("cut_out"):
         message = f"plain {color}, which was made transparent (scene.cut_out)"
         if color in COLOURS and at_evaluation(scene.background) != color:
@@ -173,15 +173,15 @@ def baked_background(evidence: Evidence) -> Check:
     return (wrong if scene.space == "bounded" and scene.background != "none" else look)(message, cure)
 
 
-def masks(evidence: Evidence) -> Check:
+def masks(analysis: Analysis) -> Check:
     """Judge how much the masks keep."""
-    if evidence.scene.pixels.mask is None:
+    if analysis.scene.pixels.mask is None:
         return ok("none")
-    kept = evidence.looks.kept
+    kept = analysis.looks.unmasked
     message = f"{100 * float(kept.mean()):.0f} % of the pixels are kept"
     empty = (kept < 0.02).nonzero()[:, 0].tolist()
     if float(kept.mean()) < 0.1 or float(kept.min()) < 0.02:
-        message += f"; next to nothing is left of {evidence.named(empty)}" if empty else ""
+        message += f"; next to nothing is left of {analysis.named(empty)}" if empty else ""
         return look(message, "White is kept: if the masks mean the opposite, invert them.")
     return ok(message)
 

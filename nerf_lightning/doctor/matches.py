@@ -77,7 +77,7 @@ def strongest_proof(
 
 
 def matched_pairs(
-    cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], shown: bool = False
+    cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], visible: bool = False
 ) -> Matches:
     """Return places matched between the two views of each pair; cameras are for the shrunk pictures."""
 
@@ -86,13 +86,13 @@ def matched_pairs(
         found = match(*(corners[view] for view in both))
         if cameras.lens_model == "equirectangular":
             sides = enumerate(both)
-            found = found[torch.stack([_ahead(cameras, v, corners[v].at[found[:, side]]) for side, v in sides]).all(0)]
-        plane = [_plane(cameras, view, corners[view].at[found[:, side]]) for side, view in enumerate(both)]
+            found = found[torch.stack([_ahead(cameras, v, corners[v].xy[found[:, side]]) for side, v in sides]).all(0)]
+        plane = [_plane(cameras, view, corners[view].xy[found[:, side]]) for side, view in enumerate(both)]
         rgb = [corners[view].rgb[found[:, side]] for side, view in enumerate(both)]
         focal = cameras.focal[both].mean(dim=-1).expand(len(found), 2)
         return torch.tensor(both).expand(len(found), 2), torch.stack(plane, 1), focal, torch.stack(rgb, 1)
 
-    parts = in_threads(matched, len(pairs), "Comparing photographs", shown)
+    parts = in_threads(matched, len(pairs), "Comparing photographs", visible)
     none = (torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, 2, 2), torch.zeros(0, 2), torch.zeros(0, 2, 3))
     view, plane, focal, rgb = (torch.cat(column) for column in zip(none, *parts, strict=True))
     return Matches(view, plane, focal, rgb, tuple(sorted(corners)))
@@ -117,13 +117,13 @@ def likely_pairs(corners: Mapping[int, Corners]) -> list[tuple[int, int]]:
     return [(views[a], views[b]) for a, b in sorted(likely)]
 
 
-def _ahead(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Bool[Tensor, "places"]:
-    plane = (at - cameras.center[view]) / cameras.focal[view]
+def _ahead(cameras: Cameras, view: int, xy: Float[Tensor, "places 2"]) -> Bool[Tensor, "places"]:
+    plane = (xy - cameras.center[view]) / cameras.focal[view]
     return unproject(plane, cameras.lens[view], cameras.lens_model)[..., 2] > AHEAD
 
 
-def _plane(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Float[Tensor, "places 2"]:
-    plane = (at - cameras.center[view]) / cameras.focal[view]
+def _plane(cameras: Cameras, view: int, xy: Float[Tensor, "places 2"]) -> Float[Tensor, "places 2"]:
+    plane = (xy - cameras.center[view]) / cameras.focal[view]
     if cameras.lens_model == "pinhole":
         return plane
     local = unproject(plane, cameras.lens[view], cameras.lens_model)

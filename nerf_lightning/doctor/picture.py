@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Analysis, Check
 from nerf_lightning.doctor.epipolar import line_distances, places, rays_of
 from nerf_lightning.doctor.extent import clear_matches
 from nerf_lightning.doctor.features import small_picture
@@ -35,17 +35,17 @@ LONGER_SIDE, PANEL = 600, 480
 NEAREST, FARTHEST, STEPS = -1.5, 3.0, 400
 
 
-def about_capture(scene: Scene, place: str | None, form: str) -> str:
+def about_capture(scene: Scene, source: str | None, form: str) -> str:
     """Return one line about what was examined: the folder, its format, the number and size of photographs.
 
-    `place` is the folder or file that it was read from, if any, and `form` the name of the format for scene=.
+    `source` is the folder or file that it was read from, if any, and `form` the name of the format for scene=.
     """
     pixels = scene.pixels
     sizes = sorted(set(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)))
     largest = "{} x {}".format(*sizes[-1])
     read = f"of {largest}" if len(sizes) == 1 else f"of {len(sizes)} sizes up to {largest}"
     splits = shares(scene.splits, len(scene.view_names))
-    return f"{place or scene.name}: scene={form}, {len(scene.view_names)} photographs {read} ({splits})"
+    return f"{source or scene.name}: scene={form}, {len(scene.view_names)} photographs {read} ({splits})"
 
 
 def shares(splits: Mapping[str, Sequence[int]], num_views: int) -> str:
@@ -65,14 +65,14 @@ def shares(splits: Mapping[str, Sequence[int]], num_views: int) -> str:
 
 
 def doctor_picture(
-    evidence: Evidence, checks: Sequence[Check], about: str, width: int = 1500, height: int = 1150
+    analysis: Analysis, checks: Sequence[Check], about: str, width: int = 1500, height: int = 1150
 ) -> UInt8[Tensor, "height width 3"]:
     """Return the cameras from above and from the side, the coverage map and the verdicts; `about` is the title."""
     figure = new_figure(width, height)
     grid = figure.add_gridspec(2, 2, height_ratios=[1.25, 1.0], width_ratios=[1.0, 1.0])
-    scene, content, what = evidence.scene, evidence.scene.points, "sparse points"
+    scene, content, what = analysis.scene, analysis.scene.points, "sparse points"
     if not len(content):
-        content = places(evidence.matches, scene.cameras.c2w)[clear_matches(evidence)]
+        content = places(analysis.matches, scene.cameras.c2w)[clear_matches(analysis)]
         what = "matched details"
     content = content[:: max(1, -(-len(content) // MOST_POINTS))]
     draw_layout(figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1]), scene, content)
@@ -174,8 +174,8 @@ def _mark(axes: "Axes", places: Float[Tensor, "details 2"]) -> None:
 def _draw_lines(axes: "Axes", cameras: Cameras, matches: Matches, zoom: float) -> None:
     """Draw the rays through the first places as seen by the second camera."""
     view, other = matches.view[0].tolist()
-    rays, between = rays_of(matches, cameras.c2w, zoom)
-    along = float(between[0].norm()) * torch.logspace(NEAREST, FARTHEST, STEPS)
+    rays, baseline = rays_of(matches, cameras.c2w, zoom)
+    along = float(baseline[0].norm()) * torch.logspace(NEAREST, FARTHEST, STEPS)
     points = cameras.c2w[view, :, 3] + along[:, None, None] * rays[:, 0].float()
     local = camera_coordinates(cameras, other, points)
     # Far outside the picture a lens may fold back, and places there are meaningless.

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import MORE_DETAILS, Check, CheckFn, Evidence, look, not_judged, ok, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Analysis, Check, CheckFn, look, not_judged, ok, wrong
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.matches import Matches, Proof, strongest_proof
@@ -43,20 +43,20 @@ DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; mo
 TOO_FEW = "too few details could be found again from one photograph to another"
 
 
-def poses_and_pixels(evidence: Evidence) -> Check:
+def poses_and_pixels(analysis: Analysis) -> Check:
     """Judge whether the poses explain what photographs share."""
-    share, count = evidence.agreement, len(evidence.matches.view)
+    share, count = analysis.agreement, len(analysis.matches.view)
     if count < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
     if share >= SOUND:
         return ok(message)
-    return _by_clear_pairs(evidence, message)
+    return _by_clear_pairs(analysis, message)
 
 
-def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
+def _by_clear_pairs(analysis: Analysis, message: str) -> Check:
     """Judge all poses by pairs of photographs whose matches are certain, since most matches do not agree."""
-    pairs = clear_pairs(evidence.matches, evidence.scene.cameras)
+    pairs = clear_pairs(analysis.matches, analysis.scene.cameras)
     against = [proof for contradicts, proof in pairs if contradicts]
     if len(pairs) < FEWEST_CLEAR:
         return not_judged(f"{message}; too few photographs share enough details to tell", DOUBTFUL)
@@ -65,14 +65,14 @@ def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     if share <= 1 - MOST_AGAINST:
         return ok(message)
     cure = "See the other verdicts for the cause; if they name none, estimate the poses again (nerf poses)."
-    if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
+    if share < MOST_AGAINST or analysis.agreement >= HOPELESS:
         return look(message, cure)
     return wrong(message, cure, (against[0],))
 
 
-def focal_length(evidence: Evidence) -> Check:
+def focal_length(analysis: Analysis) -> Check:
     """Judge whether another focal length explains the pixels better."""
-    matches, cameras, c2w = thinned(evidence.matches, ENOUGH), evidence.scene.cameras, evidence.scene.cameras.c2w
+    matches, cameras, c2w = thinned(analysis.matches, ENOUGH), analysis.scene.cameras, analysis.scene.cameras.c2w
     shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
     if len(matches.view) < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
@@ -85,69 +85,69 @@ def focal_length(evidence: Evidence) -> Check:
         if max(shares[zoom] for zoom in ZOOMS if max(zoom, 1 / zoom) >= FAR_OFF) > shares[1.0] - CLEARER:
             return not_judged("other focal lengths fit as well", "It needs photographs from more sides.")
         return ok(f"{focal:.0f} pixels (median) fits the poses and the pixels best")
-    against = agreeing(evidence.matches, c2w, best) & ~evidence.agrees
+    against = agreeing(analysis.matches, c2w, best) & ~analysis.agrees
     return (wrong if off >= FAR_OFF else look)(
         f"the pixels fit the poses better with {best:g} times the focal length: {100 * shares[best]:.0f} % of matched "
         f"details agree instead of {100 * shares[1.0]:.0f} %",
         f"Set the focal length to about {best * focal:.0f} pixels (it is {focal:.0f}); often it belongs to photographs "
         "of another size, or the field of view is that of the other side.",
-        strongest_proof(evidence.matches, against, replace(cameras, focal=best * cameras.focal)),
+        strongest_proof(analysis.matches, against, replace(cameras, focal=best * cameras.focal)),
     )
 
 
-def single_poses(evidence: Evidence) -> Check:
+def single_poses(analysis: Analysis) -> Check:
     """Judge each view's pose by the views that share most with it."""
-    matches, c2w = evidence.matches, evidence.scene.cameras.c2w
+    matches, c2w = analysis.matches, analysis.scene.cameras.c2w
     if len(matches.view) < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
-    if evidence.agreement < SOUND:
+    if analysis.agreement < SOUND:
         # The poses as a whole may be the cause: poses_and_pixels decides.
-        share = f"{100 * evidence.agreement:.0f} % of matched details lie where the cameras say"
+        share = f"{100 * analysis.agreement:.0f} % of matched details lie where the cameras say"
         return not_judged(f"only {share}, too few to tell one view from another", DOUBTFUL)
-    bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
+    bad, judged, least = odd_views(matches, analysis.agrees, len(c2w))
     found = f"{judged} of {len(matches.views)} views could be judged"
     if 2 * judged < len(matches.views):
         return not_judged(f"only {found}", MORE_DETAILS)
     if not bad:
         return ok(f"{found}, and agree with their neighbors (least {least:.0%})")
     others = [view for view in range(len(c2w)) if view not in bad]
-    doubted = [view for view in bad if not is_vouched_for(evidence, view, others)]
+    doubted = [view for view in bad if not is_vouched_for(analysis, view, others)]
     if not doubted:
-        return ok(f"{found}; {evidence.named(bad)} agree with the nearest views")
-    better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(evidence, view, bad))]
+        return ok(f"{found}; {analysis.named(bad)} agree with the nearest views")
+    better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(analysis, view, bad))]
     if not better:
-        message = f"few details that {evidence.named(doubted)} share with others lie where the cameras say"
+        message = f"few details that {analysis.named(doubted)} share with others lie where the cameras say"
         return not_judged(f"{message}, but no other pose fits better", DOUBTFUL)
-    return _wrong_poses(evidence, better, bad)
+    return _wrong_poses(analysis, better, bad)
 
 
-def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[int]) -> Check:
-    c2w = evidence.scene.cameras.c2w
-    least, views = CONVINCING * evidence.agreement, [pose.view for pose in better]
-    fits = {view: fitting_pose(evidence.matches, c2w, view, suspects, least) for view in views}
+def _wrong_poses(analysis: Analysis, better: list[BetterPose], suspects: list[int]) -> Check:
+    c2w = analysis.scene.cameras.c2w
+    least, views = CONVINCING * analysis.agreement, [pose.view for pose in better]
+    fits = {view: fitting_pose(analysis.matches, c2w, view, suspects, least) for view in views}
     mixed_up = {view: other for view, other in fits.items() if other is not None}
-    swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in mixed_up.items()]
+    swapped = [f"{analysis.named([a])} fits the camera of {analysis.named([b])}" for a, b in mixed_up.items()]
     turned = [
-        f"{evidence.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % "
+        f"{analysis.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % "
         f"of its details lie where that one says, {100 * pose.before:.0f} % where the given one does)"
         for pose in better
         if fits[pose.view] is None
     ]
     return wrong(
-        f"the pose of {evidence.named(views)} contradicts what its photograph shares with others; "
+        f"the pose of {analysis.named(views)} contradicts what its photograph shares with others; "
         + "; ".join([*swapped, *turned][:MOST_TOLD]),
         "Give each photograph its own pose (swap them back), or remove these views (scene.frames, or from the file)."
         if swapped
         else "Remove these views (scene.frames, or from the file), or estimate their poses again.",
-        tuple(proof for pose in better for proof in _proof_of(evidence, pose)),
+        tuple(proof for pose in better for proof in _proof_of(analysis, pose)),
     )
 
 
-def _proof_of(evidence: Evidence, pose: BetterPose) -> tuple[Proof, ...]:
-    matches, cameras = evidence.matches, evidence.scene.cameras
+def _proof_of(analysis: Analysis, pose: BetterPose) -> tuple[Proof, ...]:
+    matches, cameras = analysis.matches, analysis.scene.cameras
     c2w = with_pose(cameras.c2w, pose.view, pose.pose)
     shared = (matches.view == pose.view).any(dim=1) & torch.isin(matches.view, torch.tensor(pose.neighbors)).any(dim=1)
-    against = agreeing(matches, c2w) & ~evidence.agrees & shared
+    against = agreeing(matches, c2w) & ~analysis.agrees & shared
     return strongest_proof(matches, against, replace(cameras, c2w=c2w), pose.view)
 
 
@@ -222,9 +222,9 @@ def _share(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0)
     return float(agreeing(matches, c2w, zoom).float().mean()) if len(matches.view) else 0.0
 
 
-def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
+def best_reading(analysis: Analysis, readings: tuple[Reading, ...], fine: str) -> Check:
     """Judge whether another reading of the capture explains the pixels better; `fine`: the message if not."""
-    scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
+    scene, matches = analysis.scene, thinned(analysis.matches, ENOUGH)
     if len(matches.view) < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
     given = _share(matches, scene.cameras.c2w)
@@ -234,14 +234,14 @@ def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -
         if given < HOPELESS:
             return not_judged("too few details lie where the cameras say, under any convention", DOUBTFUL)
         return ok(f"{fine}: no other convention fits the images better")
-    poses, changed = readings[best].change(scene, evidence.matches)
-    fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None
-    against = agreeing(changed, poses) & ~evidence.agrees
+    poses, changed = readings[best].change(scene, analysis.matches)
+    fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is analysis.matches else None
+    against = agreeing(changed, poses) & ~analysis.agrees
     return wrong(
         f"the poses look {readings[best].says}: {100 * shares[best]:.0f} % of matched details then agree, instead of "
         f"{100 * given:.0f} %",
         readings[best].cure,
-        strongest_proof(evidence.matches, against, fits),
+        strongest_proof(analysis.matches, against, fits),
     )
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.doctor.check import Evidence
+from nerf_lightning.doctor.check import Analysis
 from nerf_lightning.doctor.epipolar import agreeing, parallax, rays_of
 from nerf_lightning.doctor.features import shrunk_cameras
 from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs, nearest_views
@@ -53,22 +53,22 @@ class BetterPose:
     """Rotation between the given pose and this one."""
 
 
-def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
+def is_vouched_for(analysis: Analysis, view: int, others: list[int]) -> bool:
     """Return whether the nearest of `others`, which are not contradicted, agree with a view."""
-    c2w = evidence.scene.cameras.c2w
-    known = torch.tensor([other for other in others if other in evidence.corners], dtype=torch.long)
+    c2w = analysis.scene.cameras.c2w
+    known = torch.tensor([other for other in others if other in analysis.corners], dtype=torch.long)
     pairs = [(view, other) for other in nearest_views(c2w, torch.tensor([view]), known, NEAREST)[0].tolist()]
-    matches = matched_pairs(shrunk_cameras(evidence.scene.cameras), evidence.corners, pairs)
+    matches = matched_pairs(shrunk_cameras(analysis.scene.cameras), analysis.corners, pairs)
     agrees = agreeing(matches, c2w)
-    return int(agrees.sum()) >= FEWEST_FOR and float(agrees.float().mean()) >= SPEAKS_FOR * evidence.agreement
+    return int(agrees.sum()) >= FEWEST_FOR and float(agrees.float().mean()) >= SPEAKS_FOR * analysis.agreement
 
 
-def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPose | None:
+def better_pose(analysis: Analysis, view: int, suspects: list[int]) -> BetterPose | None:
     """Return the pose that explains what a view shares with others, if one does and the given one does not.
 
     What the view shares with `suspects`, all contradicted views, proves nothing.
     """
-    c2w, own = evidence.scene.cameras.c2w, _of_view(evidence.matches, view, suspects)
+    c2w, own = analysis.scene.cameras.c2w, _of_view(analysis.matches, view, suspects)
     partner = own.view[:, 1]
     if len(own.view) < FEWEST or len(partner.unique()) < 2:
         return None
@@ -80,7 +80,7 @@ def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPos
     speaking, counts = partner[gained].unique(return_counts=True)
     strong = speaking[counts >= FEWEST_OF_A_PAIR][counts[counts >= FEWEST_OF_A_PAIR].argsort(descending=True)]
     share = float(explained[best].float().mean())
-    if int(gained.sum()) < FEWEST or len(strong) < 2 or share < max(CONVINCING * evidence.agreement, MOST):
+    if int(gained.sum()) < FEWEST or len(strong) < 2 or share < max(CONVINCING * analysis.agreement, MOST):
         return None
     turn = poses[best, :, :3].T @ c2w[view, :, :3]
     degrees = float((0.5 * (turn.diagonal().sum() - 1)).clamp(-1, 1).acos().rad2deg())

@@ -111,7 +111,7 @@ class Training:
             for table in tables_of(self.train_step.objective.model):
                 table.mul_(LEARNT)
         self.optimizer.zero_grad()
-        self.train_step.gradients(self.loader.at(0, 0).to(self.train_step.device), self.train_step.key)
+        self.train_step.gradients(self.loader.batch_at(0, 0).to(self.train_step.device), self.train_step.key)
         named = self.train_step.objective.model.named_parameters()
         return {name: value.grad.clone() for name, value in named if value.grad is not None}
 
@@ -119,7 +119,7 @@ class Training:
         """Train, and return the PSNR of the held-out views."""
         train_step, errors = self.train_step, RayErrors()
         for _ in range(STEPS):
-            train_step(self.loader.at(0, train_step.progress.rays_seen).to(train_step.device), self.optimizer)
+            train_step(self.loader.batch_at(0, train_step.progress.rays_seen).to(train_step.device), self.optimizer)
         with torch.no_grad():
             for batch in self.held_out:
                 errors.of(train_step.objective, batch.to(train_step.device), train_step.tiles.points)

@@ -36,7 +36,7 @@ def measured_tile(settings: TrainerSettings, train_step: TrainStep, batches: Ray
     model, learns_cameras = train_step.objective.model, train_step.objective.rays.learns_cameras
     if model.takes_whole_rays(train_step.device, training=True, learns_cameras=learns_cameras):
         return WHOLE_RAYS_TILE, None
-    batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
+    batch = batches.batch_at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = _rays_in_time(settings, train_step, batch)
     points = num_rays * model.points_per_ray(training=True)
     tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES

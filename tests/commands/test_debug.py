@@ -46,7 +46,7 @@ def test_overfit_learns_few_photographs_without_a_random_number(train, monkeypat
     assert run.psnr > 0
     splits = run.model.scene.splits
     made = nl.build_run("scene=npz", f"scene.path={run.folder.parent / 'capture.npz'}", *SMALL, "data.overfit_views=2")
-    assert set(made.data.batches.at(0, 0).pixels.view.tolist()) <= set(splits["train"])
+    assert set(made.data.batches.batch_at(0, 0).pixels.view.tolist()) <= set(splits["train"])
     assert made.data.scene.splits["train"] == made.data.scene.splits["val"] != splits["val"]
     assert len(made.data.scene.splits["train"]) == 2
     refused(train, "data.overfit_views=0", parts=("data.overfit_views=0", "at least one"))

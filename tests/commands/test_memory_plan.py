@@ -44,7 +44,7 @@ def test_a_step_and_a_picture_take_less_than_half_of_the_bound(name):
     bound = sum(need.num_bytes for need in needs(settings, train_step, data))
 
     def work():
-        batch = data.batches.at(0, 0)
+        batch = data.batches.batch_at(0, 0)
         train_step(batch, optimizer)
         with torch.no_grad():
             render_picture(train_step.objective.model, train_step.objective.rays, 0, "white", 8192)

@@ -34,7 +34,7 @@ def test_the_shares_of_a_step_add_up_to_the_step(monkeypatch, world):
     scene = ball_scene()
     scene.pixels.__dict__["mask"] = torch.rand(scene.pixels.rgba.shape[0]) > 0.3
     whole, losses = gradients(make_step(100), scene)
-    weight = RayBatches(scene, make_step(100).progress, 0, 64).at(0, 0).weight.sum()
+    weight = RayBatches(scene, make_step(100).progress, 0, 64).batch_at(0, 0).weight.sum()
     total, total_losses = 0.0, 0.0
     for number in range(world):
         monkeypatch.setattr(ranks, "world_size", lambda: world)

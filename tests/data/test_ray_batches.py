@@ -81,7 +81,7 @@ def test_a_gathered_batch_is_the_pixels_own_colour_and_the_loader_follows_the_ru
     first = next(stream)
     assert torch.equal(next(stream).rgba, first.rgba)  # nothing was trained on: the same batch again
     loader.progress.advance(32)
-    assert torch.equal(next(stream).rgba, loader.at(0, 32).rgba)
+    assert torch.equal(next(stream).rgba, loader.batch_at(0, 32).rgba)
     assert len(loader) == 14  # 3 views of 12 x 12 pixels, 32 at a time
 
 

@@ -111,7 +111,7 @@ def test_every_known_pixel_of_a_training_view_comes_once_an_epoch_with_its_dista
     loader, seen = loader_of(scene), []
     trained = [row for row in range(20) if row % 3 != 2]
     for step in range(7):
-        batch = loader.at(0, 32 * step)
+        batch = loader.batch_at(0, 32 * step)
         assert batch.certainty.count_nonzero() == 8
         assert not batch.certainty[:24].any()
         rows = (batch.distance[24:] - 1.0).long()
@@ -134,25 +134,25 @@ def test_the_other_rays_still_show_every_pixel_once_an_epoch():
 def test_batches_of_another_size_show_the_same_rays(batch_rays):
     """What is seen is a function of how many rays were seen, so a resume under a budget goes on exactly."""
     scene = scene_with_depths()
-    whole = loader_of(scene, 400).at(0, 0)
-    parts = [loader_of(scene, batch_rays).at(0, first, batch_rays) for first in range(0, 400, batch_rays)]
+    whole = loader_of(scene, 400).batch_at(0, 0)
+    parts = [loader_of(scene, batch_rays).batch_at(0, first, batch_rays) for first in range(0, 400, batch_rays)]
     known = torch.cat([part.distance[part.certainty > 0] for part in parts])
     assert torch.equal(known, whole.distance[whole.certainty > 0])
 
 
 def test_processes_share_one_batch_with_depths(monkeypatch):
-    scene, whole = scene_with_depths(), loader_of(scene_with_depths()).at(0, 64)
+    scene, whole = scene_with_depths(), loader_of(scene_with_depths()).batch_at(0, 64)
     parts = []
     for rank in range(2):
         monkeypatch.setattr(ranks, "share", lambda count, rank=rank: slice(rank * count // 2, (rank + 1) * count // 2))
-        parts.append(loader_of(scene).at(0, 64))
+        parts.append(loader_of(scene).batch_at(0, 64))
     for mine, all_of_it in zip(zip(*(part.tensors() for part in parts), strict=True), whole.tensors(), strict=True):
         assert torch.equal(torch.cat(mine), all_of_it)
 
 
 def test_squares_hold_their_known_pixel():
     scene = scene_with_depths()
-    batch = loader_of(scene, 128, 4, patch=4).at(0, 0)
+    batch = loader_of(scene, 128, 4, patch=4).batch_at(0, 0)
     assert batch.num_rays == 128
     assert batch.certainty.view(8, 16).count_nonzero(dim=1).tolist() == [0, 0, 0, 0, 0, 0, 1, 1]
     for ray in batch.certainty.nonzero()[:, 0].tolist():
@@ -162,14 +162,14 @@ def test_squares_hold_their_known_pixel():
 
 def test_without_depths_or_a_loss_for_them_batches_are_as_ever_and_masked_pixels_tell_no_distance():
     scene = scene_with_depths()
-    plain = RayBatches(scene, Progress(), 0, 32).at(0, 64)
+    plain = RayBatches(scene, Progress(), 0, 32).batch_at(0, 64)
     assert plain.distance is None
-    without = RayBatches(ball_scene(), Progress(), 0, 32, depth_every=4).at(0, 64)
+    without = RayBatches(ball_scene(), Progress(), 0, 32, depth_every=4).batch_at(0, 64)
     assert torch.equal(plain.pixels.x, without.pixels.x)
     held_out = replace(scene, depths=scene.depths[2:3])
-    assert RayBatches(held_out, Progress(), 0, 32, depth_every=4).at(0, 64).distance is None
+    assert RayBatches(held_out, Progress(), 0, 32, depth_every=4).batch_at(0, 64).distance is None
     masked = replace(scene, pixels=replace(scene.pixels, mask=torch.zeros(len(scene.pixels.rgba), dtype=torch.uint8)))
-    assert not loader_of(masked).at(0, 0).certainty.any()
+    assert not loader_of(masked).batch_at(0, 0).certainty.any()
 
 
 def test_tiles_add_up_with_distances():
@@ -179,7 +179,7 @@ def test_tiles_add_up_with_distances():
     for tile_points in (None, 200):
         train_step = make_step(tile_points)
         train_step.objective.loss = DepthLoss(every=4, beside=1.0)
-        batch = RayBatches(scene_with_depths(), train_step.progress, 0, 64, depth_every=4).at(0, 0)
+        batch = RayBatches(scene_with_depths(), train_step.progress, 0, 64, depth_every=4).batch_at(0, 0)
         seen = train_step.gradients(batch, train_step.key)
         found.append(seen.losses)
         # What is seen from beside the cameras is compared with no photograph, by nobody.

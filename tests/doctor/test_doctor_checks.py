@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support.captures import real_capture
-from support.doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
+from support.doctor_scene import VIEWS, but_poses, corner_analysis, corner_scene, with_pictures, with_poses, with_scene
 from support.scenes import ball_scene
 from torch.nn.functional import avg_pool2d
 
@@ -12,7 +12,7 @@ from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.doctor import check, extent, gate
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.doctor.examine import advice, examine, gather_evidence
+from nerf_lightning.doctor.examine import advice, analyze, examine
 from nerf_lightning.doctor.features import fineness_of
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
@@ -21,8 +21,8 @@ TYPED = {"near": "8", "far": "12"}
 """What the protocol of a scene has where a person has said it."""
 
 
-def judged(evidence, name, verdict, *fragments):
-    check = but_poses(evidence)[name]
+def judged(analysis, name, verdict, *fragments):
+    check = but_poses(analysis)[name]
     assert check.verdict == verdict, check
     for fragment in fragments:
         assert fragment in check.message + " " + check.cure
@@ -52,7 +52,7 @@ def moved_camera(rgba, height, width):
 
 def test_a_photograph_whose_camera_moved_is_named_and_no_sharp_one():
     scene = corner_scene()
-    sharp = gather_evidence(scene)
+    sharp = analyze(scene)
     judged(sharp, "sharpness", "ok")
     for view, height, width in ((3, 1, 5), (5, 5, 1), (7, 9, 1)):
         pixels, fineness = replace(scene.pixels, rgba=scene.pixels.rgba.clone()), sharp.looks.fineness.clone()
@@ -113,12 +113,12 @@ def test_views_are_compared_a_few_at_a_time(monkeypatch):
         rgba[1], rgba[9] = rgba[0], rgba[8]
         return rgba
 
-    evidence = with_pictures(copy)
-    whole = but_poses(evidence)
+    analysis = with_pictures(copy)
+    whole = but_poses(analysis)
     monkeypatch.setattr(check, "PAIRS_AT_ONCE", 5 * VIEWS)
     assert check.rows_at_once(VIEWS) == 5
-    assert whole.items() <= but_poses(evidence).items()
-    judged(evidence, "duplicates", "look", "2 pairs")
+    assert whole.items() <= but_poses(analysis).items()
+    judged(analysis, "duplicates", "look", "2 pairs")
 
 
 def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_are_named():
@@ -128,7 +128,7 @@ def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_a
     near = float(check.cure.split("near=")[1].split()[0])
     judged(with_scene(near=torch.full((VIEWS,), near)), "near and far", "ok")
     scene = corner_scene()
-    found = but_poses(corner_evidence())["near and far"].message
+    found = but_poses(corner_analysis())["near and far"].message
     low, high = (float(found.split("lies ")[1].split()[place]) for place in (0, 2))
     near, far = torch.full((VIEWS,), 39.37 * low), torch.full((VIEWS,), 39.37 * high)
     judged(with_scene(near=near, far=far, protocol=TYPED), "near and far", "wrong", "inches", "too large")
@@ -138,9 +138,9 @@ def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_a
 @pytest.mark.parametrize("near", [0.0, 1.0])
 def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
     at_cameras = (torch.arange(VIEWS), torch.zeros(VIEWS))
-    monkeypatch.setattr(extent, "content_distances", lambda evidence: at_cameras)
-    evidence = with_scene(near=torch.full((VIEWS,), near), far=torch.full((VIEWS,), near - 0.1), protocol=TYPED)
-    assert extent.near_and_far(evidence).verdict == "wrong"
+    monkeypatch.setattr(extent, "content_distances", lambda analysis: at_cameras)
+    analysis = with_scene(near=torch.full((VIEWS,), near), far=torch.full((VIEWS,), near - 0.1), protocol=TYPED)
+    assert extent.near_and_far(analysis).verdict == "wrong"
 
 
 @pytest.mark.parametrize(
@@ -168,9 +168,9 @@ def test_a_background_that_is_baked_in_or_was_cut_out_is_named():
     rgba = scene.pixels.rgba.clone()
     rgba[rgba[:, 3] == 0] = 255
     pixels = replace(scene.pixels, rgba=rgba, has_transparency=False)
-    evidence = gather_evidence(replace(scene, pixels=pixels))
-    judged(evidence, "background", "wrong", "opaque on a background that is white", "scene.background=white")
-    judged(replace(evidence, scene=replace(evidence.scene, background="white")), "background", "ok")
+    analysis = analyze(replace(scene, pixels=pixels))
+    judged(analysis, "background", "wrong", "opaque on a background that is white", "scene.background=white")
+    judged(replace(analysis, scene=replace(analysis.scene, background="white")), "background", "ok")
     cut = {"background": "black", "protocol": {"cut_out": "white"}}
     judged(with_scene(**cut), "background", "look", "plain white, which was made transparent", "scene.background=white")
     judged(with_scene(**cut | {"background": "white"}), "background", "ok")
@@ -211,8 +211,8 @@ def test_masks_that_keep_nothing_are_named():
     scene = corner_scene()
     mask = torch.ones(len(scene.pixels.rgba), dtype=torch.uint8)
     mask[: len(mask) // VIEWS] = 0
-    evidence = gather_evidence(replace(scene, pixels=replace(scene.pixels, mask=mask)))
-    judged(evidence, "masks", "look", "view 0.png", "invert them")
+    analysis = analyze(replace(scene, pixels=replace(scene.pixels, mask=mask)))
+    judged(analysis, "masks", "look", "view 0.png", "invert them")
 
 
 def rolled(c2w, quarters):
@@ -242,36 +242,36 @@ def cropped(center):
 def test_cameras_that_no_photographer_has_are_named(attribute, change, name, verdict, says):
     cameras = corner_scene().cameras
     changed = change(getattr(cameras, attribute).clone())
-    evidence = (
+    analysis = (
         with_poses(changed) if attribute == "c2w" else with_scene(cameras=replace(cameras, **{attribute: changed}))
     )
-    judged(evidence, name, verdict, says)
+    judged(analysis, name, verdict, says)
 
 
 def test_cameras_that_look_away_are_wrong_without_any_detail():
     scene = ball_scene(10, 12)
     flipped = torch.cat([scene.cameras.c2w[..., :3] * torch.tensor([1.0, -1, -1]), scene.cameras.c2w[..., 3:]], dim=-1)
-    evidence, _ = examine(replace(scene, cameras=replace(scene.cameras, c2w=flipped)))
-    judged(evidence, "camera directions", "wrong", "OpenCV's axes rather than OpenGL's")
-    judged(evidence, "scene box", "wrong")
+    analysis, _ = examine(replace(scene, cameras=replace(scene.cameras, c2w=flipped)))
+    judged(analysis, "camera directions", "wrong", "OpenCV's axes rather than OpenGL's")
+    judged(analysis, "scene box", "wrong")
 
 
 @pytest.mark.parametrize(("factor", "says"), [(0.1, "inside it"), (40.0, "a dot")])
 def test_a_capture_of_another_scale_than_its_box_is_wrong(factor, says):
     scene = ball_scene(10, 12)
     c2w = scene.cameras.c2w * torch.tensor([1.0, 1, 1, factor])
-    evidence = gather_evidence(replace(scene, cameras=replace(scene.cameras, c2w=c2w)))
-    judged(evidence, "scale", "wrong", says)
+    analysis = analyze(replace(scene, cameras=replace(scene.cameras, c2w=c2w)))
+    judged(analysis, "scale", "wrong", says)
 
 
 def test_a_hole_in_a_ring_of_views_is_noted():
     scene = ball_scene(16, 12)
-    judged(gather_evidence(scene), "coverage", "ok", "seen from 33")
+    judged(analyze(scene), "coverage", "ok", "seen from 33")
     kept = torch.arange(12)
     cameras = replace(scene.cameras[kept], lens_model="pinhole")
-    evidence = gather_evidence(ball_scene(12, 12))
-    evidence = replace(evidence, scene=replace(evidence.scene, cameras=cameras))
-    judged(evidence, "coverage", "look", "gap of 112 degrees", "Take 12 more photographs between ball_11 and ball_0")
+    analysis = analyze(ball_scene(12, 12))
+    analysis = replace(analysis, scene=replace(analysis.scene, cameras=cameras))
+    judged(analysis, "coverage", "look", "gap of 112 degrees", "Take 12 more photographs between ball_11 and ball_0")
 
 
 @pytest.mark.data

@@ -3,20 +3,20 @@ from dataclasses import replace
 import pytest
 import torch
 from support.corner import corner_poses
-from support.doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
+from support.doctor_scene import VIEWS, corner_analysis, corner_scene, outcome, with_pictures, with_poses
 
 from nerf_lightning.doctor import poses
 from nerf_lightning.doctor.conventions import axes, inverted, mirrored, transposed
 from nerf_lightning.doctor.epipolar import agreeing, distances, parallax, places
-from nerf_lightning.doctor.examine import gather_evidence
+from nerf_lightning.doctor.examine import analyze
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.nerf.geometry.cameras import project
 from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation, rotation_from_quaternion
 
 
-def judged(name, evidence):
+def judged(name, analysis):
     """What the check of this name says: one of them takes longer than all others."""
-    return poses.CHECKS[name](evidence)
+    return poses.CHECKS[name](analysis)
 
 
 def c2w():
@@ -57,10 +57,10 @@ def with_quaternions(poses):
 
 
 def test_a_sound_capture_has_nothing_wrong():
-    checks = outcome(corner_evidence())
+    checks = outcome(corner_analysis())
     assert {check.name: check.message for check in checks.values() if check.verdict == "wrong"} == {}
     assert all(checks[name].verdict == "ok" and not checks[name].cure for name in poses.CHECKS)
-    assert corner_evidence().agreement > 0.7
+    assert corner_analysis().agreement > 0.7
 
 
 @pytest.mark.parametrize(
@@ -104,13 +104,13 @@ def test_rows_in_numeric_order_are_named():
     by_text = sorted(range(VIEWS), key=lambda view: names[view])
     # The reader pairs row k with the k-th name as text, but the rows' maker counted.
     views = torch.tensor(by_text)
-    sound = corner_evidence()
+    sound = corner_analysis()
     back = torch.empty(VIEWS, dtype=torch.long)
     back[views] = torch.arange(VIEWS)
     matches = replace(sound.matches, view=back[sound.matches.view], views=tuple(range(VIEWS)))
     scene = replace(sound.scene, view_names=tuple(names[view] for view in by_text))
-    evidence = replace(sound, scene=scene, matches=matches, agrees=agreeing(matches, scene.cameras.c2w))
-    check = judged("order of photographs", evidence)
+    analysis = replace(sound, scene=scene, matches=matches, agrees=agreeing(matches, scene.cameras.c2w))
+    check = judged("order of photographs", analysis)
     assert check.verdict == "wrong"
     assert "numbers in the photographs' names" in check.message
 
@@ -119,7 +119,7 @@ def test_rows_in_numeric_order_are_named():
 def test_a_focal_length_of_another_resolution_is_named(factor):
     scene = corner_scene()
     cameras = replace(scene.cameras, focal=scene.cameras.focal * factor)
-    check = judged("focal length", gather_evidence(replace(scene, cameras=cameras)))
+    check = judged("focal length", analyze(replace(scene, cameras=cameras)))
     assert check.verdict == "wrong"
     told = float(check.cure.split("about ")[1].split()[0])
     assert told == pytest.approx(300.0, rel=0.11)
@@ -136,9 +136,9 @@ def test_cameras_that_all_look_the_same_way_do_not_tell_the_focal_length():
     view = torch.tensor(pairs).repeat_interleave(50, dim=0)
     plane = torch.cat([torch.stack([seen[a], seen[b]], dim=1) for a, b in pairs])
     matches = Matches(view, plane, torch.full((200, 2), 300.0), torch.zeros(200, 2, 3), tuple(range(5)))
-    evidence = replace(corner_evidence(), scene=scene, matches=matches, agrees=agreeing(matches, side_by_side))
-    assert evidence.agreement == 1.0
-    assert judged("focal length", evidence).verdict == "not judged"
+    analysis = replace(corner_analysis(), scene=scene, matches=matches, agrees=agreeing(matches, side_by_side))
+    assert analysis.agreement == 1.0
+    assert judged("focal length", analysis).verdict == "not judged"
 
 
 def test_mirrored_photographs_are_named():

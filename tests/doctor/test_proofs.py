@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.doctor_scene import VIEWS, corner_evidence, corner_scene, with_poses
+from support.doctor_scene import VIEWS, corner_analysis, corner_scene, with_poses
 from support.planted_poses import rotation_about
 
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
@@ -17,21 +17,21 @@ from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 VIEW = 5
 
 
-def with_mistaken_matches(evidence, share=1.0, view=VIEW):
+def with_mistaken_matches(analysis, share=1.0, view=VIEW):
     """A part of one photograph's details were taken for others that look the same."""
     random = torch.Generator().manual_seed(2)
-    rows = (evidence.matches.view == view).any(dim=1).nonzero()[:, 0]
+    rows = (analysis.matches.view == view).any(dim=1).nonzero()[:, 0]
     rows = rows[torch.rand(len(rows), generator=random) < share]
-    plane = evidence.matches.plane.clone()
+    plane = analysis.matches.plane.clone()
     plane[rows, 1] = plane[rows[torch.randperm(len(rows), generator=random)], 1]
-    matches = replace(evidence.matches, plane=plane)
-    return replace(evidence, matches=matches, agrees=agreeing(matches, evidence.scene.cameras.c2w))
+    matches = replace(analysis.matches, plane=plane)
+    return replace(analysis, matches=matches, agrees=agreeing(matches, analysis.scene.cameras.c2w))
 
 
-def without_corners(evidence, view=VIEW):
+def without_corners(analysis, view=VIEW):
     """Nothing can be found again in one photograph."""
-    blank = Corners(torch.zeros(0, 2), evidence.corners[view].descriptor[:0], torch.zeros(0, 3))
-    return replace(evidence, corners={**evidence.corners, view: blank})
+    blank = Corners(torch.zeros(0, 2), analysis.corners[view].descriptor[:0], torch.zeros(0, 3))
+    return replace(analysis, corners={**analysis.corners, view: blank})
 
 
 def turned(degrees, view=VIEW):
@@ -41,86 +41,86 @@ def turned(degrees, view=VIEW):
 
 
 def test_a_pose_that_the_nearest_views_confirm_is_right_whatever_others_say():
-    check = single_poses(with_mistaken_matches(corner_evidence()))
+    check = single_poses(with_mistaken_matches(corner_analysis()))
     assert check.verdict == "ok"
     assert "view 5.png agree with the nearest views" in check.message
 
 
 def test_matches_that_no_pose_explains_prove_nothing():
-    evidence = without_corners(with_mistaken_matches(corner_evidence()))
+    analysis = without_corners(with_mistaken_matches(corner_analysis()))
     others = [view for view in range(VIEWS) if view != VIEW]
-    assert not is_vouched_for(evidence, VIEW, others)
-    assert better_pose(evidence, VIEW, [VIEW]) is None
-    check = single_poses(evidence)
+    assert not is_vouched_for(analysis, VIEW, others)
+    assert better_pose(analysis, VIEW, [VIEW]) is None
+    check = single_poses(analysis)
     assert check.verdict == "not judged"
     assert "view 5.png share with others lie where the cameras say, but no other pose fits better" in check.message
 
 
 def test_a_pose_that_explains_less_than_most_of_the_matches_proves_nothing():
     """It may belong to the other side of a thing whose sides look alike."""
-    evidence = with_mistaken_matches(turned(10.0), 0.5)
+    analysis = with_mistaken_matches(turned(10.0), 0.5)
     assert better_pose(turned(10.0), VIEW, [VIEW]) is not None
-    assert better_pose(evidence, VIEW, [VIEW]) is None
-    assert single_poses(evidence).verdict == "not judged"
+    assert better_pose(analysis, VIEW, [VIEW]) is None
+    assert single_poses(analysis).verdict == "not judged"
 
 
 @pytest.mark.parametrize("degrees", [3.0, 10.0])
 def test_the_pose_that_fits_is_the_one_before_the_camera_was_turned(degrees):
-    evidence = turned(degrees)
-    found = better_pose(evidence, VIEW, [VIEW])
+    analysis = turned(degrees)
+    found = better_pose(analysis, VIEW, [VIEW])
     assert found.degrees == pytest.approx(degrees, abs=0.4)
     right = corner_scene().cameras.c2w
     apart = float((found.pose[:, 3] - right[VIEW, :, 3]).norm())
     assert apart < 0.05 * float((right[0, :, 3] - right[-1, :, 3]).norm())
-    check = single_poses(evidence)
+    check = single_poses(analysis)
     assert check.verdict == "wrong"
     assert "the pose of view 5.png contradicts" in check.message
     assert "degrees away" in check.message
 
 
 def test_a_proof_holds_details_off_the_given_lines_and_on_those_that_fit_and_has_a_row_in_the_picture():
-    evidence = turned(5.0)
-    (proof,) = single_poses(evidence).proofs
+    analysis = turned(5.0)
+    (proof,) = single_poses(analysis).proofs
     assert len(proof.matches.view) >= 8
     assert set(proof.matches.view[:, 0].tolist()) == {VIEW}
-    assert float(line_distances(proof.matches, evidence.scene.cameras.c2w).median()) > 4.0
+    assert float(line_distances(proof.matches, analysis.scene.cameras.c2w).median()) > 4.0
     assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
-    one, two = (proof_picture(evidence.scene, [proof] * count) for count in (1, 2))
+    one, two = (proof_picture(analysis.scene, [proof] * count) for count in (1, 2))
     assert one.shape[1] == two.shape[1]
     assert two.shape[0] > 1.8 * one.shape[0]
     assert int(one.float().std()) > 10
 
 
 def test_another_convention_is_proved_with_cameras_that_fit():
-    evidence = with_poses(axes(corner_scene().cameras.c2w, FLIP_YZ))
-    (proof,) = CHECKS["axes"](evidence).proofs
+    analysis = with_poses(axes(corner_scene().cameras.c2w, FLIP_YZ))
+    (proof,) = CHECKS["axes"](analysis).proofs
     assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
-    assert not bool(agreeing(proof.matches, evidence.scene.cameras.c2w).any())
+    assert not bool(agreeing(proof.matches, analysis.scene.cameras.c2w).any())
 
 
-def with_mistaken_pairs(evidence, share):
+def with_mistaken_pairs(analysis, share):
     """Of so many pairs of photographs, the details were taken for others that look the same."""
-    _, pair = evidence.matches.view.unique(dim=0, return_inverse=True)
+    _, pair = analysis.matches.view.unique(dim=0, return_inverse=True)
     random = torch.Generator().manual_seed(4)
-    plane = evidence.matches.plane.clone()
+    plane = analysis.matches.plane.clone()
     for number in torch.randperm(int(pair.max()) + 1, generator=random)[: int(share * (int(pair.max()) + 1))].tolist():
         rows = (pair == number).nonzero()[:, 0]
         plane[rows, 1] = plane[rows[torch.randperm(len(rows), generator=random)], 1]
-    matches = replace(evidence.matches, plane=plane)
-    return replace(evidence, matches=matches, agrees=agreeing(matches, evidence.scene.cameras.c2w))
+    matches = replace(analysis.matches, plane=plane)
+    return replace(analysis, matches=matches, agrees=agreeing(matches, analysis.scene.cameras.c2w))
 
 
 def test_mistakes_prove_nothing_of_the_poses():
-    evidence = with_mistaken_pairs(corner_evidence(), 1.0)
-    assert evidence.agreement < 0.3
+    analysis = with_mistaken_pairs(corner_analysis(), 1.0)
+    assert analysis.agreement < 0.3
     for judge in (poses_and_pixels, *CHECKS.values()):
-        check = judge(evidence)
+        check = judge(analysis)
         assert check.verdict == "not judged"
         assert check.cure
 
 
 def test_a_few_clear_pairs_tell_whether_all_poses_are_right():
-    right = with_mistaken_pairs(corner_evidence(), 0.7)
+    right = with_mistaken_pairs(corner_analysis(), 0.7)
     assert right.agreement < 0.4
     assert poses_and_pixels(right).verdict == "ok"
     single = single_poses(right)

@@ -64,7 +64,7 @@ def test_it_learns_renders_and_is_saved(added):
     train_step = a_step(ADDED[added])
     loader = RayBatches(scene, train_step.progress, 0, 96, patch=train_step.objective.loss.patch)
     optimizer = train_step.new_optimizer()
-    losses = [train_step(loader.at(0, train_step.progress.rays_seen), optimizer).losses[-1] for _ in range(35)]
+    losses = [train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer).losses[-1] for _ in range(35)]
     assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
     assert train_step.guard.skipped == 0
     objective, again = train_step.objective, a_step(ADDED[added]).objective
@@ -79,7 +79,7 @@ def test_the_penalty_of_an_encoder_inside_the_model_reaches_its_gradients_once(t
     for weight in (0.0, 1.0):
         train_step = a_step([*ADDED["an encoder with a penalty"], f"encoder.total_variation={weight}"])
         train_step.tiles.points = tile_points
-        train_step.gradients(RayBatches(scene, train_step.progress, 0, 96).at(0, 0), train_step.key)
+        train_step.gradients(RayBatches(scene, train_step.progress, 0, 96).batch_at(0, 0), train_step.key)
         gradients.append(train_step.objective.model.last.field.position_encoder.planes.grad)
     encoder = train_step.objective.model.last.field.position_encoder
     (expected,) = torch.autograd.grad(encoder.penalty(), [encoder.planes])
@@ -89,7 +89,7 @@ def test_the_penalty_of_an_encoder_inside_the_model_reaches_its_gradients_once(t
 
 def test_each_term_of_a_weighted_sum_is_told_apart_and_their_sum_is_minimised():
     scene, train_step = ball_scene(num_views=8, size=16), a_step(ADDED["a structural loss beside the squared error"])
-    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 96, patch=4).at(0, 0), train_step.key)
+    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 96, patch=4).batch_at(0, 0), train_step.key)
     assert list(seen.terms) == ["mse", "dssim"]
     assert float(seen.terms["dssim"].min()) > 0
     torch.testing.assert_close(seen.losses, seen.terms["mse"] + seen.terms["dssim"])
@@ -100,7 +100,8 @@ def test_a_channel_is_trained_rendered_filmed_and_exported_without_being_listed(
     scene, train_step = ball_scene(num_views=8, size=16, background="black"), a_step(ADDED["a semantic channel"])
     loader, optimizer = RayBatches(scene, train_step.progress, 0, 96), train_step.new_optimizer()
     terms = [
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer).terms["bright"].sum() for _ in range(40)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer).terms["bright"].sum()
+        for _ in range(40)
     ]
     assert float(torch.stack(terms[-5:]).mean()) < 0.9 * float(torch.stack(terms[:5]).mean())
     model = train_step.objective.model.eval()
@@ -129,7 +130,7 @@ def test_a_weighted_sum_refuses_what_does_not_fit():
 def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
     train_step = a_step(ADDED["a packed sampler without a grid"])
     torch.nn.init.normal_(train_step.objective.model.last.field.position_encoder.table)
-    rays = train_step.objective.rays(RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0).pixels)
+    rays = train_step.objective.rays(RayBatches(ball_scene(), train_step.progress, 0, 64).batch_at(0, 0).pixels)
     whole = train_step.objective.model(rays, torch.ones(64, 3), None)[0]
     with torch.no_grad():
         walked = train_step.objective.model(rays, torch.ones(64, 3), None)[0]

@@ -10,8 +10,8 @@ from support.corner import FOCAL, HEIGHT, WIDTH, corner_poses, photograph
 
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.doctor import poses
-from nerf_lightning.doctor.check import Check, Evidence
-from nerf_lightning.doctor.examine import CHECKS, gather_evidence
+from nerf_lightning.doctor.check import Analysis, Check
+from nerf_lightning.doctor.examine import CHECKS, analyze
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
@@ -46,36 +46,36 @@ def corner_scene() -> Scene:
 
 
 @cache
-def corner_evidence() -> Evidence:
+def corner_analysis() -> Analysis:
     """What the checks see of the sound capture."""
-    return gather_evidence(corner_scene())
+    return analyze(corner_scene())
 
 
-def with_poses(c2w: torch.Tensor) -> Evidence:
+def with_poses(c2w: torch.Tensor) -> Analysis:
     """The same photographs, so the same matches, with other poses."""
-    return planted_poses.with_poses(corner_evidence(), c2w)
+    return planted_poses.with_poses(corner_analysis(), c2w)
 
 
-def with_scene(**changes) -> Evidence:
+def with_scene(**changes) -> Analysis:
     """The same photographs and cameras, with other fields of the scene."""
-    sound = corner_evidence()
+    sound = corner_analysis()
     return replace(sound, scene=replace(sound.scene, **changes))
 
 
-def with_pictures(change) -> Evidence:
+def with_pictures(change) -> Analysis:
     """Photographs after `change` (views, height, width, 4) -> the same."""
     scene = corner_scene()
     rgba = change(scene.pixels.rgba.view(VIEWS, HEIGHT, WIDTH, 4).clone())
     transparent = bool((rgba[..., 3] < 255).any())
     pixels = replace(scene.pixels, rgba=rgba.reshape(-1, 4), has_transparency=transparent)
-    return gather_evidence(replace(scene, pixels=pixels))
+    return analyze(replace(scene, pixels=pixels))
 
 
-def outcome(evidence: Evidence, but: Collection[str] = ()) -> dict[str, Check]:
+def outcome(analysis: Analysis, but: Collection[str] = ()) -> dict[str, Check]:
     """Every check by its name."""
-    return {name: replace(check(evidence), name=name) for name, check in CHECKS.items() if name not in but}
+    return {name: replace(check(analysis), name=name) for name, check in CHECKS.items() if name not in but}
 
 
-def but_poses(evidence: Evidence) -> dict[str, Check]:
+def but_poses(analysis: Analysis) -> dict[str, Check]:
     """All but those that try many readings of the poses, which take longer."""
-    return outcome(evidence, poses.CHECKS)
+    return outcome(analysis, poses.CHECKS)

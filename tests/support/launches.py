@@ -148,7 +148,7 @@ def measured(model: str, precision: str) -> dict[str, Any]:
             launches.counts.clear()
             run.step()
         step, losses = dict(launches.counts), run.all_losses().tolist()
-        rays = run.training.objective.rays(run.loader.at(0, 0).pixels)
+        rays = run.training.objective.rays(run.loader.batch_at(0, 0).pixels)
         launches.counts.clear()
         with torch.no_grad():
             run.training.objective.model.eval()(rays, torch.ones_like(rays.origins), None)

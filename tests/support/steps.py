@@ -51,5 +51,5 @@ def gradients(train_step, scene, steps=1):
     """The gradients and the losses of the last of some steps."""
     loader, optimizer = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer()
     for _ in range(steps):
-        seen = train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        seen = train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen.losses

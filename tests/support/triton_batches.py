@@ -33,14 +33,14 @@ def check_pixels(kernels, device, generator, rays):
         return made
 
     for masked, every, attempt, seen in ((False, 0, 0, 0), (True, 8, 1, 33 * rays), (True, 3, 0, (1 << 33) + 5)):
-        expected = batches("cpu", masked, every).at(attempt, seen)
+        expected = batches("cpu", masked, every).batch_at(attempt, seen)
         with patch.object(op, "cuda_backend", lambda *given: kernels):
-            found = batches(device, masked, every).at(attempt, seen)
+            found = batches(device, masked, every).batch_at(attempt, seen)
         assert len(found.tensors()) == (7 if every else 5)
         for one, other in zip(found.tensors(), expected.tensors(), strict=True):
             assert torch.equal(one.cpu(), other)
     with patch.object(op, "cuda_backend", lambda *given: kernels):
-        assert batches(device, True, 0).at(0, 0, 0).num_rays == 0
+        assert batches(device, True, 0).batch_at(0, 0, 0).num_rays == 0
 
 
 def check_rays(kernels, device, generator, rays):

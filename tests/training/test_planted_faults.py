@@ -34,7 +34,7 @@ def trained(scene, steps, *settings):
     data = build(config.data)(scene=scene, progress=progress, seed=0, patch=train_step.objective.loss.patch)
     optimizer = train_step.new_optimizer()
     for _ in range(steps):
-        train_step(data.batches.at(progress.attempt, progress.rays_seen), optimizer)
+        train_step(data.batches.batch_at(progress.attempt, progress.rays_seen), optimizer)
     train_step.objective.model.eval()
     return train_step
 

@@ -146,9 +146,11 @@ def test_what_cannot_be_recorded_is_computed_without(error, cause, caplog):
 def test_a_recorded_step_that_is_not_finite_changes_nothing_and_is_counted(monkeypatch):
     run = trained([48] * 3, record=True)
     before = {name: value.clone() for name, value in run.training.objective.model.named_parameters()}
-    batch = run.loader.at(0, 0)
+    batch = run.loader.batch_at(0, 0)
     with monkeypatch.context() as patch:
-        patch.setattr(run.loader, "at", lambda *place: replace(batch, rgba=torch.full_like(batch.rgba, torch.nan)))
+        patch.setattr(
+            run.loader, "batch_at", lambda *place: replace(batch, rgba=torch.full_like(batch.rgba, torch.nan))
+        )
         run.step()
     assert run.training.guard.state() == [1, 1]
     for name, value in run.training.objective.model.named_parameters():

@@ -39,7 +39,7 @@ def test_clipping_scales_the_whole_gradient_whose_norms_are_measured_before_for_
     assert abs(float(gradient.norm()) - 1e-3) < 1e-6
     clipped, whole = make_step(100, clip_norm=1e-3), make_step(100)
     scene = ball_scene()
-    batch = RayBatches(scene, clipped.progress, 0, 64).at(0, 0)
+    batch = RayBatches(scene, clipped.progress, 0, 64).batch_at(0, 0)
     seen = clipped(batch, clipped.new_optimizer(), measure_gradients=True)
     RayBatches(scene, whole.progress, 0, 64)
     assert whole(batch, whole.new_optimizer()).gradient_norms == {}
@@ -59,7 +59,7 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     for weights in (good, broken, broken, good):
         with torch.no_grad():
             color.copy_(weights)
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     assert steps == [0, 3]
     assert train_step.guard.skipped == 2
     assert train_step.guard.state() == [2, 0]
@@ -141,13 +141,13 @@ def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
     scene, found = ball_scene(), []
     for train_step in (robust_step(None), robust_step(tile_points)):
         loader = RayBatches(scene, train_step.progress, 0, 64, patch=4)
-        seen = train_step(loader.at(0, 0), train_step.new_optimizer())
+        seen = train_step(loader.batch_at(0, 0), train_step.new_optimizer())
         flat = torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()])
         found.append((flat, seen.losses, train_step.objective.loss.threshold))
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
     assert float(found[0][2]) != pytest.approx(0.05)
     plain = make_step(None)
-    plain(RayBatches(scene, plain.progress, 0, 64, patch=4).at(0, 0), plain.new_optimizer())
+    plain(RayBatches(scene, plain.progress, 0, 64, patch=4).batch_at(0, 0), plain.new_optimizer())
     assert not torch.allclose(found[0][0], torch.cat([p.grad.flatten() for p in plain.objective.model.parameters()]))
 
 
@@ -156,14 +156,14 @@ def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_smaller_batch
     loader, optimizer = RayBatches(ball_scene(), train_step.progress, 0, 64, patch=4), train_step.new_optimizer()
     with torch.no_grad():
         train_step.objective.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    train_step(loader.at(0, 0), optimizer)
+    train_step(loader.batch_at(0, 0), optimizer)
     assert float(train_step.objective.loss.threshold) == pytest.approx(0.05)
     restart(train_step, optimizer)
     assert float(train_step.objective.loss.threshold) == 1.0
     train_step = make_step(None, sample_budget=8 * 40)
     train_step.objective.loss = RobustLoss(MeanSquaredError(), patch=4)
     loader = RayBatches(ball_scene(), train_step.progress, 0, 64, patch=4)
-    train_step(loader.at(0, 0), train_step.new_optimizer())
+    train_step(loader.batch_at(0, 0), train_step.new_optimizer())
     assert train_step.progress.batch_rays == 16
 
 
@@ -183,7 +183,7 @@ def a_step_with_shifts(tile_points=None, model=None, **settings):
 
 
 def batch_of(train_step):
-    return RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
+    return RayBatches(ball_scene(), train_step.progress, 0, 64).batch_at(0, 0)
 
 
 def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_model_does():
@@ -254,7 +254,7 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
     losses, gradients = [], []
     for model in (plain, frowning):
         train_step = make_step(tile_points, model)
-        batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
+        batch = RayBatches(scene, train_step.progress, 0, 64).batch_at(0, 0)
         seen = train_step.gradients(batch, train_step.key)
         losses.append(seen.losses)
         gradients.append(torch.cat([each.grad.flatten() for each in model.parameters()]))

@@ -37,7 +37,7 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     train_step = make_step(tile_points, copy.deepcopy(model))
     optimizer = train_step.new_optimizer()
     optimizer.zero_grad()
-    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
+    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).batch_at(0, 0)
     seen = train_step.gradients(batch, train_step.key, backward=backward)
     counts = torch.cat([count.float() for count in sample_counts(train_step.objective.model)] or [torch.zeros(1)])
     return torch.cat([p.grad.flatten() for p in train_step.objective.model.parameters()]), seen, counts

@@ -52,13 +52,13 @@ class Part:
 
 def block(low: Triple, high: Triple, material: Material) -> Part:
     """Return the box between two corners."""
-    size, center = _between(low, high)
+    size, center = _size_and_center(low, high)
     return Part(BOX, size, center, ALONG_Z, material)
 
 
 def slope(low: Triple, high: Triple, start: tuple[float, float], end: tuple[float, float], material: Material) -> Part:
     """Return a box cut by the plane through two points (x, z); what lies to the right of start -> end is removed."""
-    size, center = _between(low, high)
+    size, center = _size_and_center(low, high)
     run, rise = end[0] - start[0], end[1] - start[1]
     length = float(np.hypot(run, rise))
     cut_x, cut_z = rise / length, -run / length
@@ -76,7 +76,7 @@ def ball(center: Triple, radius: float, material: Material) -> Part:
     return Part(BALL, (radius,), center, ALONG_Z, material)
 
 
-def _between(low: Triple, high: Triple) -> tuple[Triple, Triple]:
+def _size_and_center(low: Triple, high: Triple) -> tuple[Triple, Triple]:
     half = tuple(0.5 * (b - a) for a, b in zip(low, high, strict=True))
     middle = tuple(0.5 * (a + b) for a, b in zip(low, high, strict=True))
     return half, middle  # type: ignore[return-value]

@@ -38,7 +38,7 @@ class Pinhole:
 
 
 @dataclass(frozen=True)
-class Found:
+class Hits:
     """The rays that hit something; pixels of the picture and rays of a pixel are numbered row by row."""
 
     pixel: Int[ndarray, "hits"]
@@ -65,12 +65,12 @@ class Tracer:
         """
         pixels = views[0].resolution ** 2
         each = [self.find(view, SIDES, self.fast) for view in views]
-        pixel = np.concatenate([found.pixel + i * pixels for i, found in enumerate(each)])
-        found = _joined(each)
-        normals = self.fast.normals(found.points, found.part)
-        lit = key_visible(self.fast, found.points, normals, found.ray, self.light)
-        open_ = self._openness(found, normals, pixel)
-        colors = shade(self.palette, self.light, found.part, normals, found.directions, lit, open_)
+        pixel = np.concatenate([hits.pixel + i * pixels for i, hits in enumerate(each)])
+        hits = _joined(each)
+        normals = self.fast.normals(hits.points, hits.part)
+        lit = key_visible(self.fast, hits.points, normals, hits.ray, self.light)
+        open_ = self._openness(hits, normals, pixel)
+        colors = shade(self.palette, self.light, hits.part, normals, hits.directions, lit, open_)
         count = np.bincount(pixel, minlength=len(views) * pixels)
         sums = [np.bincount(pixel, channel, minlength=count.size) for channel in colors]
         rgb = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
@@ -79,14 +79,14 @@ class Tracer:
 
     def geometry(self, view: Pinhole) -> tuple[Float[ndarray, "pixels"], Float[ndarray, "pixels 3"]]:
         """Return depth (inf: nothing) and world normals (zero: nothing) through the pixels' centers."""
-        found = self.find(view, 1, self.solids)
+        hits = self.find(view, 1, self.solids)
         depth = np.full(view.resolution**2, np.inf, np.float32)
         normals = np.zeros((view.resolution**2, 3), np.float32)
-        depth[found.pixel] = found.depth
-        normals[found.pixel] = self.solids.normals(found.points, found.part).T
+        depth[hits.pixel] = hits.depth
+        normals[hits.pixel] = self.solids.normals(hits.points, hits.part).T
         return depth, normals
 
-    def find(self, view: Pinhole, sides: int, solids: Solids) -> Found:
+    def find(self, view: Pinhole, sides: int, solids: Solids) -> Hits:
         """Return the first hits of `sides` x `sides` rays through each pixel, centered in equal squares."""
         upper, lower = view.rectangles(self.corners)
         tile = TILE if sides > 1 else 2 * TILE
@@ -100,24 +100,24 @@ class Tracer:
         return _joined(found)
 
     def _openness(
-        self, found: Found, normals: Float[ndarray, "3 hits"], pixel: Int[ndarray, "hits"]
+        self, hits: Hits, normals: Float[ndarray, "3 hits"], pixel: Int[ndarray, "hits"]
     ) -> Float[ndarray, "hits"]:
         """Return each pixel's mean openness, queried only on the diagonal of the 4 x 4 rays, as it varies slowly.
 
         If no ray on the diagonal hits, every ray of the pixel is queried.
         """
-        asked = found.ray % (SIDES + 1) == 0
+        asked = hits.ray % (SIDES + 1) == 0
         asked |= np.bincount(pixel, asked)[pixel] == 0
-        values = openness(self.fast, found.points[:, asked], normals[:, asked], found.ray[asked])
+        values = openness(self.fast, hits.points[:, asked], normals[:, asked], hits.ray[asked])
         sums, counts = np.bincount(pixel[asked], values), np.bincount(pixel[asked])
         return (sums / np.maximum(counts, 1)).astype(values.dtype)[pixel]
 
 
-def _joined(each: Sequence[Found]) -> Found:
-    return Found(*(np.concatenate([getattr(f, name) for f in each], axis=-1) for name in vars(each[0])))
+def _joined(each: Sequence[Hits]) -> Hits:
+    return Hits(*(np.concatenate([getattr(f, name) for f in each], axis=-1) for name in vars(each[0])))
 
 
-def _trace_tile(view: Pinhole, left: int, top: int, tile: int, sides: int, candidates: Solids) -> Found:
+def _trace_tile(view: Pinhole, left: int, top: int, tile: int, sides: int, candidates: Solids) -> Hits:
     """Return the hits in a square of `tile` pixels, cut off at the picture's edge."""
     columns = np.arange(left, min(left + tile, view.resolution))
     rows = np.arange(top, min(top + tile, view.resolution))
@@ -131,4 +131,4 @@ def _trace_tile(view: Pinhole, left: int, top: int, tile: int, sides: int, candi
     hit = np.flatnonzero(part != NOTHING)
     pixel = y[hit].astype(np.int64) * view.resolution + x[hit].astype(np.int64)
     points = origin + depth[hit] * directions[:, hit]
-    return Found(pixel, hit % sides**2, part[hit], depth[hit], points, directions[:, hit])
+    return Hits(pixel, hit % sides**2, part[hit], depth[hit], points, directions[:, hit])

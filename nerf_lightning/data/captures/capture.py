@@ -68,33 +68,33 @@ class Capture:
     depth_unit: float = 1e-3
     """Length of a level of the views' depth maps, in units of the capture; sensors count millimeters."""
 
-    def some(self, kept: Sequence[int]) -> "Capture":
+    def some(self, views: Sequence[int]) -> "Capture":
         """Return some of the views, in order; the splits follow."""
-        place = {number: new for new, number in enumerate(kept)}
+        place = {number: new for new, number in enumerate(views)}
         splits = self.splits and {
             split: tuple(place[number] for number in numbers if number in place)
             for split, numbers in self.splits.items()
         }
-        bounds = None if self.bounds is None else self.bounds[list(kept)]
+        bounds = None if self.bounds is None else self.bounds[list(views)]
         numbers = torch.full((len(self.views),), -1)
-        numbers[list(kept)] = torch.arange(len(kept))
+        numbers[list(views)] = torch.arange(len(views))
         tracks = torch.stack([self.tracks[:, 0], numbers[self.tracks[:, 1]]], dim=1)
         return replace(
             self,
-            views=tuple(self.views[number] for number in kept),
+            views=tuple(self.views[number] for number in views),
             bounds=bounds,
             splits=splits,
             tracks=tracks[tracks[:, 1] >= 0],
         )
 
-    def some_points(self, kept: Bool[Tensor, "points"]) -> "Capture":
+    def some_points(self, mask: Bool[Tensor, "points"]) -> "Capture":
         """Return the capture with some of its sparse points; the tracks follow."""
-        tracks = self.tracks[kept[self.tracks[:, 0]]]
-        numbers = kept.cumsum(dim=0) - 1
+        tracks = self.tracks[mask[self.tracks[:, 0]]]
+        numbers = mask.cumsum(dim=0) - 1
         return replace(
             self,
-            points=self.points[kept],
-            point_errors=self.point_errors[kept] if len(self.point_errors) else self.point_errors,
+            points=self.points[mask],
+            point_errors=self.point_errors[mask] if len(self.point_errors) else self.point_errors,
             tracks=torch.stack([numbers[tracks[:, 0]], tracks[:, 1]], dim=1),
         )
 

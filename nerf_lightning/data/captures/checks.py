@@ -312,7 +312,7 @@ def _warn_of_overlap(where: str, names: tuple[str, ...], of: int) -> None:
     )
 
 
-def check_cameras(cameras: Cameras, place: str, where: str) -> None:
+def check_cameras(cameras: Cameras, key: str, where: str) -> None:
     """Refuse numbers that are not valid cameras; see `check_scene`.
 
     Raises:
@@ -320,17 +320,17 @@ def check_cameras(cameras: Cameras, place: str, where: str) -> None:
         InputError: a picture of more than `budgets.view_pixels`.
     """
     if not bool(is_rigid(cameras.c2w).all()):
-        raise Mismatch(f"{place}.c2w", "holds a pose that is not a rotation and a center")
+        raise Mismatch(f"{key}.c2w", "holds a pose that is not a rotation and a center")
     sizes = torch.stack([cameras.width, cameras.height]).double()
     if float(sizes.min()) < 1:
-        raise Mismatch(f"{place}.width", "is not above 0")
+        raise Mismatch(f"{key}.width", "is not above 0")
     require_within("view_pixels", int(sizes.prod(dim=0).max()), where, "pixels in one picture")
     for name in ("c2w", "focal", "center", "lens", "ndc"):
         numbers = getattr(cameras, name)
         if numbers is not None and float(numbers.abs().max()) > FARTHEST:
-            raise Mismatch(f"{place}.{name}", f"has numbers beyond {FARTHEST:g}")
+            raise Mismatch(f"{key}.{name}", f"has numbers beyond {FARTHEST:g}")
     if float(cameras.focal.min()) < LEAST_FOCAL or (cameras.ndc is not None and float(cameras.ndc.min()) <= 0):
-        raise Mismatch(f"{place}.focal", f"is not at least {LEAST_FOCAL:g}")
+        raise Mismatch(f"{key}.focal", f"is not at least {LEAST_FOCAL:g}")
 
 
 def _check_similarity(to_user: Float[Tensor, "4 4"]) -> None:

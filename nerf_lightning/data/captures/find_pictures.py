@@ -70,7 +70,7 @@ def find_pictures(
     root: Path,
     source: Path,
     outside: bool = False,
-    beside: Collection[Path] | None = None,
+    photographs: Collection[Path] | None = None,
 ) -> dict[str, Path]:
     """Return the file of each name; names without a match are absent.
 
@@ -83,7 +83,7 @@ def find_pictures(
         root: the capture's folder.
         source: the file that contains the names, for messages.
         outside: whether names may point outside `root` and `folder`.
-        beside: the photographs, to find what belongs to them: masks, which may be called with _mask, or depth maps.
+        photographs: to find what belongs to them: masks, which may be called with _mask, or depth maps.
             None: find photographs, and log any that is found by another name.
 
     Raises:
@@ -91,15 +91,17 @@ def find_pictures(
     """
     inside = [Path(os.path.abspath(each)) for each in (root, folder)]
     exact = {
-        name: path for name in names if (path := named_picture(folder, name, None if outside else inside, beside or ()))
+        name: path
+        for name in names
+        if (path := named_picture(folder, name, None if outside else inside, photographs or ()))
     }
     if len(exact) == len(names):
         return exact
     others = [name for name in names if name not in exact]
-    taken = {*exact.values(), *(beside or ())}
-    rules = _rules(others, root, folder, beside, taken)
-    if not rules and beside is not None:
-        rules = _rules(others, root, folder, beside, taken, by_number=True)
+    taken = {*exact.values(), *(photographs or ())}
+    rules = _rules(others, root, folder, photographs, taken)
+    if not rules and photographs is not None:
+        rules = _rules(others, root, folder, photographs, taken, by_number=True)
     if exact:
         # The names are right, and some files are missing; but their case or extension may differ, or the machine.
         rules = {
@@ -118,11 +120,11 @@ def find_pictures(
         raise InputError(
             f"{source} names pictures such as {names[0]}, which match files of {listed(rule.folder for rule in same)} "
             f"equally well. Move all but one of these folders out of {root}, or choose one with "
-            f"{'scene=colmap scene.images=FOLDER' if beside is None else 'scene.masks=FOLDER'}."
+            f"{'scene=colmap scene.images=FOLDER' if photographs is None else 'scene.masks=FOLDER'}."
         )
     found = rules[best]
     name, path = next(iter(found.items()))
-    if beside is None:
+    if photographs is None:
         usual = _rank(best, folder, root)[2] < len(PICTURE_FOLDERS)
         log.log(
             logging.INFO if usual else logging.WARNING,
@@ -245,12 +247,12 @@ def _rules(
     names: Sequence[str],
     root: Path,
     folder: Path,
-    beside: Collection[Path] | None,
+    photographs: Collection[Path] | None,
     taken: Collection[Path],
     by_number: bool = False,
 ) -> dict[Rule, dict[str, Path]]:
     """Return the files that each rule finds, if it finds a different one for every name, and none that is taken."""
-    below = _by_plain_name(dict.fromkeys((root, folder)), beside is not None, taken, by_number)
+    below = _by_plain_name(dict.fromkeys((root, folder)), photographs is not None, taken, by_number)
     fits: dict[Rule, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     for name in names:
         if not (parts := _parts(name)):
@@ -303,10 +305,10 @@ def numeric_order(names: Sequence[str]) -> list[str]:
     return sorted(names, key=lambda name: [(text, int(digits or 0)) for text, digits in NUMBERS.findall(name)])
 
 
-def _one_each(found: dict[str, list[Path]]) -> dict[str, Path]:
+def _one_each(matches: dict[str, list[Path]]) -> dict[str, Path]:
     """Return the one file that matches each name: of several, the one whose extension matches, too."""
     chosen = {}
-    for name, paths in found.items():
+    for name, paths in matches.items():
         alike = [path for path in paths if path.suffix.lower() == Path(name).suffix.lower()]
         for few in (paths, alike):
             if len(few) == 1:

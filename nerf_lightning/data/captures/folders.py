@@ -15,7 +15,7 @@ PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "
 DEEPEST, MOST_FOLDERS = 3, 1000
 """How deep below a folder, and in how many folders of a level, captures are searched for."""
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 def named_folder(root: str) -> Path:
@@ -36,7 +36,7 @@ def named_folder(root: str) -> Path:
     return folder
 
 
-def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:
+def located(folder: Path, capture_in: Callable[[Path], Result | None]) -> list[Result]:
     """Return a folder's own capture, as a list of one; or the capture that contains it, or those below it.
 
     Args:
@@ -44,7 +44,7 @@ def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Fo
         capture_in: returns what a folder itself contains; None if it contains no capture.
     """
 
-    def near(path: Path) -> Found | None:
+    def near(path: Path) -> Result | None:
         try:
             return capture_in(path)
         except (OSError, InputError):  # not a folder that the user named

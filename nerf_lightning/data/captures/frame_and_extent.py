@@ -53,7 +53,7 @@ LEAST_AHEAD = 0.1
 
 
 def choose_space(
-    asked: Space | Literal["auto"],
+    requested: Space | Literal["auto"],
     cameras: Cameras,
     capture: Capture,
     has_transparency: bool,
@@ -61,13 +61,13 @@ def choose_space(
 ) -> tuple[Space, str]:
     """Return the space and the reason; refuse NDC if it cannot work. `near` is as for `extent_of`."""
     cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
-    if asked == "ndc" and not ahead:
+    if requested == "ndc" and not ahead:
         raise InputError(
             f"scene.space=ndc needs cameras that all look the same way, but some pixels of {capture.source} look "
             "sideways or back. Use scene.space=contracted, or auto."
         )
-    if asked != "auto":
-        return asked, "as asked"
+    if requested != "auto":
+        return requested, "as asked"
     if has_transparency:
         return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
     if ahead and cosine > FORWARD_FACING and (capture.bounds is not None or len(capture.points)):

@@ -10,7 +10,7 @@ from nerf_lightning.messages.escaping import listed
 
 FEWEST_VIEWS = 3
 """Minimum number that must remain once a view is left out."""
-SHOWN = 3
+MAX_LISTED = 3
 ALL_CAMERAS = "To use them, let their cameras be found: scene=photos scene.root=FOLDER, their folder."
 """The advice where more photographs lack a pose than have one."""
 
@@ -52,7 +52,7 @@ class LeftOut:
             raise InputError(first)
         raise InputError(
             f"{first} {len(self.faults)} of the {total} views of {self.source} cannot be used "
-            f"({listed(self.faults, SHOWN)}), and {FEWEST_VIEWS} must remain."
+            f"({listed(self.faults, MAX_LISTED)}), and {FEWEST_VIEWS} must remain."
         )
 
     def say(self, remaining: int) -> None:
@@ -60,7 +60,7 @@ class LeftOut:
         if self.faults:
             log.warning(
                 "%s: %d of %d views are left out: %s. The first: %s",
-                *(self.source, len(self.faults), remaining + len(self.faults), listed(self.faults, SHOWN)),
+                *(self.source, len(self.faults), remaining + len(self.faults), listed(self.faults, MAX_LISTED)),
                 next(iter(self.faults.values())),
             )
         if self.without_pose:

@@ -110,4 +110,4 @@ def _suitable(folder: Path, capture: Capture) -> tuple[dict[str, Path], str | No
 
 def _masks_in(folder: Path, capture: Capture) -> dict[str, Path]:
     photographs = {view.photograph.path for view in capture.views}
-    return find_pictures([view.name for view in capture.views], folder, folder, capture.source, beside=photographs)
+    return find_pictures([view.name for view in capture.views], folder, folder, capture.source, photographs=photographs)

@@ -20,7 +20,7 @@ from nerf_lightning.data.captures.folders import located, named_folder, require_
 from nerf_lightning.data.captures.intrinsics import as_calibrated, cameras_of
 from nerf_lightning.data.captures.mask_files import with_masks
 from nerf_lightning.data.captures.scene import Coordinates, Spaces, check_extent, scene_of
-from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
+from nerf_lightning.data.captures.splits import MEMORISED, every_kth, without_held_out
 from nerf_lightning.data.pixels.decoded_photographs import read_photographs, upright_size
 from nerf_lightning.data.pixels.masks import MaskColor
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
@@ -80,7 +80,7 @@ class CaptureReader(Reader):
         name: the scene's name in reports.
     """
 
-    behind: ClassVar[Background] = "black"
+    default_background: ClassVar[Background] = "black"
     """The format's default background."""
 
     root: str
@@ -153,7 +153,7 @@ class CaptureReader(Reader):
             space=self.space,
             near=self.near,
             far=self.far,
-            background=background_for(self.background, color, self.behind),
+            background=background_for(self.background, color, self.default_background),
             protocol=protocol | remembered,
             metres_per_unit=self.metres_per_unit,
             coordinates=self.coordinates,
@@ -245,7 +245,7 @@ class CaptureReader(Reader):
         require_one_of(get_args(Axes), **{"scene.axes": self.axes})
         require_one_of(get_args(Poses), **{"scene.poses": self.poses})
         check_metres(self.metres_per_unit)
-        background_for(self.background, None, self.behind)
+        background_for(self.background, None, self.default_background)
         check_extent(self.space, self.near, self.far, self.coordinates, self.aabb_half)
 
     def _wanted(self, capture: Capture) -> Capture:
@@ -267,7 +267,7 @@ class CaptureReader(Reader):
         given = capture.splits or {"train": tuple(range(len(capture.views)))}
         train, val, test = (given.get(split, ()) for split in ("train", "val", "test"))
         names = [view.name for view in capture.views]
-        train = apart(train, val, test, names.__getitem__, str(capture.source))
+        train = without_held_out(train, val, test, names.__getitem__, str(capture.source))
         if not train:
             raise InputError(
                 f"{capture.source} lists no training view that exists. Fix its lists, or remove them so that "

@@ -42,7 +42,7 @@ def every_kth(views: Sequence[int], k: int) -> tuple[tuple[int, ...], tuple[int,
     return _both(tuple(view for view in views if view not in out), held)
 
 
-def apart(
+def without_held_out(
     train: Sequence[View], val: Sequence[View], test: Sequence[View], named: Callable[[View], str], source: str
 ) -> tuple[View, ...]:
     """Return the training views without the held-out ones, and log which are left out.

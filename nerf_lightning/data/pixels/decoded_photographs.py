@@ -141,7 +141,7 @@ def _hash_of_contents(photographs: Sequence[Photograph], label: str) -> str:
         except OSError as error:
             raise InputError(f"{paths[index]} cannot be read: {error.strerror}. Check its permissions.") from error
 
-    digests = in_threads(digest, len(paths), f"{label}: comparing", shown=len(paths) > NOTICEABLE_FILES)
+    digests = in_threads(digest, len(paths), f"{label}: comparing", visible=len(paths) > NOTICEABLE_FILES)
     return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
@@ -173,7 +173,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
                 file.write(np.ascontiguousarray(_mask(photograph, size, downscale)).data)
         return bool((rgba[..., 3] < 255).any())
 
-    transparent = each_or_faults(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
+    transparent = each_or_faults(decode, len(photographs), label, visible=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
     return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0, checksum=0)
 
 
@@ -192,7 +192,7 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
             )
         return downscaled_size(width, height, downscale)
 
-    return each_or_faults(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
+    return each_or_faults(size, len(photographs), f"{label}: sizes", visible=len(photographs) > NOTICEABLE_FILES)
 
 
 def of_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -237,12 +237,12 @@ def _mask_of(photograph: Photograph, mask: Path, size: tuple[int, int]) -> Bool[
     return kept
 
 
-def _resized(kept: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+def _resized(mask: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
     """Return a mask resized to (width, height) by nearest neighbor."""
-    if kept.shape == size[::-1]:
-        return kept
-    row, column = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size[::-1], kept.shape, strict=True))
-    return np.asarray(kept[row[:, None], column])
+    if mask.shape == size[::-1]:
+        return mask
+    row, column = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size[::-1], mask.shape, strict=True))
+    return np.asarray(mask[row[:, None], column])
 
 
 def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:

@@ -37,10 +37,10 @@ def crop_to_multiple(picture: UInt8[np.ndarray, "height width *c"], factor: int)
     return picture[:height, :width]
 
 
-def whole_blocks(kept: Bool[np.ndarray, "height width"], factor: int) -> Bool[np.ndarray, "h w"]:
+def whole_blocks(mask: Bool[np.ndarray, "height width"], factor: int) -> Bool[np.ndarray, "h w"]:
     """Return which blocks of `factor` x `factor` pixels are kept entirely; the rest of the picture is cropped."""
-    height, width = (side // factor for side in kept.shape)
-    blocks = kept[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    height, width = (side // factor for side in mask.shape)
+    blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
     return np.asarray(blocks.all(axis=(1, 3)))
 
 

@@ -179,14 +179,14 @@ class _JpegHeader(BufferedReader):
 
     def __init__(self, file: BufferedReader, path: Path):
         super().__init__(file.raw)
-        self.left, self.path = float(limits().image_header_bytes), path
+        self.remaining, self.path = float(limits().image_header_bytes), path
         self.seek(0)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Return the next bytes."""
         content = super().read(size)
-        self.left -= len(content)
-        if self.left < 0:
+        self.remaining -= len(content)
+        if self.remaining < 0:
             require_within("image_header_bytes", math.inf, self.path, "bytes of header")
         return content
 
@@ -215,7 +215,7 @@ def opened_picture(path: Path) -> Iterator[Image.Image]:
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
         if isinstance(file, _JpegHeader):
-            file.left = math.inf
+            file.remaining = math.inf
         if image.format in JPEGS:
             _check_jpeg(image, file, path)
         _check_plain(image, path)

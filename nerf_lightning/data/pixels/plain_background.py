@@ -79,14 +79,14 @@ def protocol_of(color: Color | None) -> dict[str, str]:
     return {} if color is None else {"cut_out": in_words(color)}
 
 
-def background_for(asked: str | None, color: Color | None, otherwise: Background) -> Background:
-    """Return the background `asked` for; None: `otherwise`, or what suits the color that was cut out.
+def background_for(requested: str | None, color: Color | None, otherwise: Background) -> Background:
+    """Return the `requested` background; None: `otherwise`, or what suits the color that was cut out.
 
     With a constant background, sheets of its color may grow in front of the content until nothing else is left; a
     random background per ray prevents them.
     """
-    if asked is not None:
-        return known_background(asked)
+    if requested is not None:
+        return known_background(requested)
     if color is None:
         return otherwise
     suited: dict[str, Background] = {"white": "white_or_random", "black": "black_or_random"}
@@ -109,7 +109,7 @@ def plain_color(pixels: PixelStore) -> Color | None:
     shares = torch.tensor([float(_near(edge.numpy(), (red, green, blue)).mean()) for edge in edges])
     if float((shares >= EDGE_SHARE).float().mean()) < VIEW_SHARE:
         return None
-    behind = torch.stack([_behind_thumbnail(pixels, view, (red, green, blue)) for view in views])
+    behind = torch.stack([_background_thumbnail(pixels, view, (red, green, blue)) for view in views])
     frame = behind.all(dim=0).sum() >= ALIKE * behind.any(dim=0).sum()
     return None if frame or float(behind.float().mean()) < LEAST_SHARE else (red, green, blue)
 
@@ -124,7 +124,7 @@ def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
     return np.asarray(((rgb >= low) & (rgb <= high)).all(axis=-1))
 
 
-def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def _background_mask(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """Return which pixels have the plain color and are connected to the edge through such pixels."""
     from scipy import ndimage
 
@@ -136,10 +136,10 @@ def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height
     return np.asarray(reaches[parts])
 
 
-def _behind_thumbnail(pixels: PixelStore, view: int, color: Color) -> Bool[Tensor, "side side"]:
+def _background_thumbnail(pixels: PixelStore, view: int, color: Color) -> Bool[Tensor, "side side"]:
     rgba = pixels.view(view)
     rows, columns = (torch.linspace(0, side - 1, THUMBNAIL).round().long() for side in rgba.shape[:2])
-    return torch.from_numpy(_behind(_near(rgba[rows][:, columns, :3].numpy(), color)))
+    return torch.from_numpy(_background_mask(_near(rgba[rows][:, columns, :3].numpy(), color)))
 
 
 def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.ndarray, "height width"]:
@@ -152,7 +152,7 @@ def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.
 
     plain = _near(rgba[..., :3], color)
     alpha = np.where(ndimage.binary_dilation(plain, np.ones((3, 3))), np.uint8(UNSURE), np.uint8(255))
-    alpha[_behind(plain)] = 0
+    alpha[_background_mask(plain)] = 0
     return alpha
 
 
@@ -169,5 +169,5 @@ def _write(pixels: MappedPixelStore, color: Color, target: Path) -> Header:
             file.seek(4 * int(pixels.offset[view]))
             file.write(rgba.data)
 
-    in_threads(write, len(sizes), "Cutting out", shown=len(sizes) > NOTICEABLE)
+    in_threads(write, len(sizes), "Cutting out", visible=len(sizes) > NOTICEABLE)
     return Header(FORMAT, sizes, True, masked=False, contents=None, spots=0, checksum=0)

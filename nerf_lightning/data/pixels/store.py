@@ -45,11 +45,11 @@ def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
     return PixelStore(torch.empty((num_pixels, 4), dtype=torch.uint8), *layout(sizes), has_transparency=False)
 
 
-def in_threads(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
-    """Return [work(0), ..., work(count - 1)], computed by a few threads, with a progress bar if `shown`."""
+def in_threads(work: Callable[[int], Result], count: int, label: str, visible: bool) -> list[Result]:
+    """Return [work(0), ..., work(count - 1)], computed by a few threads, with a progress bar if `visible`."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     threads = min(MAX_THREADS, num_cores())
-    with progress_bar(*columns, visible=shown) as bar, ThreadPoolExecutor(threads) as pool:
+    with progress_bar(*columns, visible=visible) as bar, ThreadPoolExecutor(threads) as pool:
         return list(bar.track(pool.map(work, range(count)), total=count, description=escape(for_terminal(label))))
 
 
@@ -61,7 +61,7 @@ class UndecodableError(InputError):
         self.faults = faults
 
 
-def each_or_faults(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
+def each_or_faults(work: Callable[[int], Result], count: int, label: str, visible: bool) -> list[Result]:
     """Return what `in_threads` does, and report all failures, not only the first."""
     faults: dict[int, str] = {}
 
@@ -72,7 +72,7 @@ def each_or_faults(work: Callable[[int], Result], count: int, label: str, shown:
             faults[index] = str(error)
             return None
 
-    results = in_threads(tried, count, label, shown)
+    results = in_threads(tried, count, label, visible)
     if faults:
         raise UndecodableError(dict(sorted(faults.items())))
     return [result for result in results if result is not None]

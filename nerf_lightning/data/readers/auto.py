@@ -48,7 +48,7 @@ def readers() -> tuple[type[CaptureReader], ...]:
 
 
 @dataclass(frozen=True)
-class Known:
+class DetectedFormat:
     """A folder of known format."""
 
     folder: Path
@@ -98,31 +98,31 @@ class AutoReader(CaptureReader):
         Raises:
             InputError: the format is unknown, or does not have a setting.
         """
-        known = self._search()
-        root = self.root if known.folder == self.folder() else str(known.folder)
-        log.info("%s: read as scene=%s, because it has %s", root, known.scene, known.file)
+        detected = self._search()
+        root = self.root if detected.folder == self.folder() else str(detected.folder)
+        log.info("%s: read as scene=%s, because it has %s", root, detected.scene, detected.file)
         chosen = self._chosen() | {"root": self.root, "name": self.name, "downscale": self.downscale}
-        if known.reader is BlenderReader and self.downscale == "auto":  # renderings, which are small
+        if detected.reader is BlenderReader and self.downscale == "auto":  # renderings, which are small
             del chosen["downscale"]
-        refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
+        refused = sorted(chosen.keys() - inspect.signature(detected.reader).parameters.keys())
         if refused:
             raise InputError(
-                f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it out."
+                f"scene.{refused[0]}: scene={detected.scene}, which {root} is, has no such setting. Leave it out."
             )
-        reader = known.reader(**chosen)
+        reader = detected.reader(**chosen)
         if not os.path.isfile(Path(self.root).expanduser()):  # a file may be a part of what its reader searches for
-            reader.found_folder = known.folder
+            reader.found_folder = detected.folder
         return reader
 
     @staticmethod
-    def known_format(folder: Path) -> Known | None:
+    def known_format(folder: Path) -> DetectedFormat | None:
         """Return what a folder itself is; None if its format is unknown."""
         for reader in readers():
             if (file := reader.found_in(folder)) is not None:
-                return Known(folder, file, reader)
+                return DetectedFormat(folder, file, reader)
         return None
 
-    def _search(self) -> Known:
+    def _search(self) -> DetectedFormat:
         """Return the folder's own format, or the only capture below it, or the one that contains it."""
         folder = self.folder()
         if (named := self._named_file()) is not None:
@@ -134,13 +134,13 @@ class AutoReader(CaptureReader):
         path = Path(self.root).expanduser()
         if path.is_file() and (other := other_format(path)) is not None:
             raise InputError(f"{self.root} is {other}.")
-        formats = listed((Known(folder, "", reader).scene for reader in readers()), len(readers()))
+        formats = listed((DetectedFormat(folder, "", reader).scene for reader in readers()), len(readers()))
         raise InputError(
             f"{self.root} holds no capture in a known format ({formats}): it holds {contents(folder)}.{self._hint()} "
             "If these are photographs without cameras, use scene=photos."
         )
 
-    def _named_file(self) -> Known | None:
+    def _named_file(self) -> DetectedFormat | None:
         """Return the reader of the file that the user named, if it belongs to a capture."""
         path = Path(self.root).expanduser()
         fitting = [reader for reader in readers() if path.suffix.lower() in reader.named_by]
@@ -149,7 +149,7 @@ class AutoReader(CaptureReader):
         likeliest = [each for each in fitting if each in FIRST] or fitting
         known = (each for each in fitting if path.name in (each.found_in(path), each.found_in(path.parent)))
         reader = next(known, likeliest[-1])
-        return Known(self.folder(), path.name, reader)
+        return DetectedFormat(self.folder(), path.name, reader)
 
     def _hint(self) -> str:
         """Return which program wrote the folder, if that is clear, and how to read its captures."""

@@ -12,7 +12,7 @@ from nerf_lightning.data.captures.folders import named_folder
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.captures.scene import Coordinates
-from nerf_lightning.data.captures.splits import apart
+from nerf_lightning.data.captures.splits import without_held_out
 from nerf_lightning.data.pixels.decoded_photographs import upright_size
 from nerf_lightning.data.pixels.picture_files import ENDINGS
 from nerf_lightning.data.readers.json_frames import FrameFile, say_of_files, views_of
@@ -34,7 +34,7 @@ class BlenderReader(CaptureReader):
     """
 
     named_by = (".json",)
-    behind: ClassVar[Background] = "white"
+    default_background: ClassVar[Background] = "white"
 
     name: str = "blender"
     coordinates: Coordinates = "given"
@@ -82,7 +82,7 @@ class BlenderReader(CaptureReader):
         ]
         left_out.require_enough(len(found))
         train, val, test = ([frame.view.photograph.path for of, frame in found if of == split] for split in SPLITS)
-        learnt = set(apart(train, val, test, lambda path: path.name, self.root))
+        learnt = set(without_held_out(train, val, test, lambda path: path.name, self.root))
         found = [(of, frame) for of, frame in found if of != "train" or frame.view.photograph.path in learnt]
         names = _shortest([(split, frame.name) for split, frame in found])
         views = tuple(replace(frame.view, name=name) for (_, frame), name in zip(found, names, strict=True))

@@ -81,7 +81,9 @@ class ColmapReader(CaptureReader):
         where = self.top() if self.images is None else self.below(self.images)
         if not os.path.isdir(where):
             raise InputError(f"{where} {what_is(where)}. Set scene.images to the photographs' folder below {root}.")
-        usual = [where] if self.images else [root / name for name in (*_beside(folder, root), *PICTURE_FOLDERS)]
+        usual = (
+            [where] if self.images else [root / name for name in (*_photograph_folders(folder, root), *PICTURE_FOLDERS)]
+        )
         pictures = next((place for place in usual if os.path.isdir(place)), where)
         files = find_pictures(names, pictures, where, folder, self.allow_outside)
         views, kept, lenses = [], [], []
@@ -150,7 +152,7 @@ def _view(image: ColmapImage, camera: ColmapCamera, path: Path) -> View:
     )
 
 
-def _beside(model: Path, root: Path) -> tuple[str, ...]:
+def _photograph_folders(model: Path, root: Path) -> tuple[str, ...]:
     """Return the folder of photographs that belongs to a model's folder, to be tried before the usual ones."""
     return ("input",) if "distorted" in model.relative_to(root).parts else ()
 

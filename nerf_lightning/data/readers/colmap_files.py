@@ -117,7 +117,7 @@ class _Bytes:
     """A file's bytes, read in order."""
 
     def __init__(self, path: Path):
-        self.path, self.place = path, 0
+        self.path, self.offset = path, 0
         self.data: bytes | mmap.mmap
         with open_regular(path, "colmap", CURE) as file:
             # Mapped: most of the file is skipped (features, tracks) and need not be in memory.
@@ -125,32 +125,32 @@ class _Bytes:
             self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def take(self, form: str) -> tuple:
-        values = struct.unpack_from(form, self.data, self.place)
+        values = struct.unpack_from(form, self.data, self.offset)
         self.skip(struct.calcsize(form))
         return values
 
     def count(self, least_bytes: int, budget: str) -> int:
         """Return the length of a list whose entries take at least `least_bytes` bytes."""
         count = int(self.take("<Q")[0])
-        if count * least_bytes > len(self.data) - self.place:
+        if count * least_bytes > len(self.data) - self.offset:
             raise ValueError(f"it claims {count:,} entries, but has {len(self.data)} bytes")
         require_within(budget, count, self.path, budget)
         return count
 
     def numbers(self, kind: str, count: int) -> ndarray:
         """Return a copy of `count` numbers of one kind."""
-        numbers = np.frombuffer(self.data, kind, count, self.place).copy()
+        numbers = np.frombuffer(self.data, kind, count, self.offset).copy()
         self.skip(numbers.nbytes)
         return numbers
 
     def skip(self, size: int) -> None:
-        self.place += size
+        self.offset += size
 
     def text(self) -> str:
-        end = self.data.find(b"\0", self.place, self.place + LONGEST_NAME)
+        end = self.data.find(b"\0", self.offset, self.offset + LONGEST_NAME)
         if end < 0:
             raise ValueError(f"it ends within a name, or has one of more than {LONGEST_NAME:,} bytes")
-        name, self.place = self.data[self.place : end], end + 1
+        name, self.offset = self.data[self.offset : end], end + 1
         try:
             return name.decode("utf-8")
         except UnicodeDecodeError:
@@ -158,8 +158,8 @@ class _Bytes:
             return name.decode(WINDOWS, "replace")
 
     def end(self) -> None:
-        if self.place != len(self.data):
-            raise ValueError(f"it claims {self.place:,} bytes, but has {len(self.data):,}")
+        if self.offset != len(self.data):
+            raise ValueError(f"it claims {self.offset:,} bytes, but has {len(self.data):,}")
 
 
 class TextFiles:

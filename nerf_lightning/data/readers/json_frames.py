@@ -92,7 +92,7 @@ class FrameFile:
         if any(key in {**self.content, **first} for key in OF_PHOTOGRAPHS):
             return True
         name, folder = first.get("file_path"), self.path.parent
-        pictures = find_pictures([name], folder, folder, self.path, beside=()) if isinstance(name, str) else {}
+        pictures = find_pictures([name], folder, folder, self.path, photographs=()) if isinstance(name, str) else {}
         if not pictures:
             return False
         try:
@@ -156,11 +156,11 @@ def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, ever
         with left_out.unless_usable(PurePosixPath(name.replace("\\", "/")).as_posix()):
             if name not in pictures:
                 raise InputError(f"{where}: {why_absent(name, file.path.parent, root)}")
-            found.append(_found(file, f"{where} ({name})", name, frame, pictures[name]))
+            found.append(_found_frame(file, f"{where} ({name})", name, frame, pictures[name]))
     return found
 
 
-def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], picture: Path) -> FoundFrame:
+def _found_frame(file: FrameFile, where: str, name: str, frame: dict[str, Any], picture: Path) -> FoundFrame:
     settings = file.content | {key: value for key, value in frame.items() if value is not None}
     lens_model, lens = lens_of(settings, where)
     header = read_header(picture)

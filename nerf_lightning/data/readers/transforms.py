@@ -109,16 +109,16 @@ class TransformsReader(CaptureReader):
         named = {view.photograph.path for view in views} | {folder / Path(name).name for name in left_out.faults}
         return tuple(path.relative_to(root).as_posix() for path in pictures_below(folder) if path not in named)
 
-    def _with_masks_and_depths(self, path: Path, found: list[FoundFrame], scale: float) -> list[View]:
+    def _with_masks_and_depths(self, path: Path, frames: list[FoundFrame], scale: float) -> list[View]:
         """Return the views with the files that frames name in addition to their pictures.
 
         Depth maps are in units before applied_scale, for which `scale` compensates.
         """
         masks, depths, others = (
-            self._files_of(path, found, key) for key in ("mask_path", "depth_file_path", "depth_path")
+            self._files_of(path, frames, key) for key in ("mask_path", "depth_file_path", "depth_path")
         )
         views, fault = [], ""
-        for each, mask, depth, other in zip(found, masks, depths, others, strict=True):
+        for each, mask, depth, other in zip(frames, masks, depths, others, strict=True):
             photograph, depth = each.view.photograph, depth or other
             if mask is not None:
                 photograph = replace(photograph, mask=mask, mask_keeps=None)
@@ -140,12 +140,12 @@ class TransformsReader(CaptureReader):
         key = next((key for key in DEPTH_UNITS if key in frame.settings), None)
         return None if key is None else length_of(frame.settings, key, str(path))
 
-    def _files_of(self, path: Path, found: list[FoundFrame], key: str) -> list[Path | None]:
+    def _files_of(self, path: Path, frames: list[FoundFrame], key: str) -> list[Path | None]:
         """Return the file that each frame names under a key; missing files are logged, and their frames stay."""
-        names = [str(each.settings[key]) if each.settings.get(key) else None for each in found]
+        names = [str(each.settings[key]) if each.settings.get(key) else None for each in frames]
         wanted = [name for name in names if name is not None]
-        photographs = {each.view.photograph.path for each in found}
-        files = find_pictures(wanted, path.parent, self.top(), path, self.allow_outside, beside=photographs)
+        photographs = {each.view.photograph.path for each in frames}
+        files = find_pictures(wanted, path.parent, self.top(), path, self.allow_outside, photographs=photographs)
         if key != "mask_path":
             files |= _arrays(
                 [name for name in wanted if name not in files], path.parent, self.top(), self.allow_outside
@@ -218,19 +218,19 @@ def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[in
     return splits if splits["val"] or splits["test"] else None
 
 
-def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ...]] | None:
+def _splits(file: FrameFile, frames: list[FoundFrame]) -> dict[str, tuple[int, ...]] | None:
     """Return the splits that the file names, or those of folders called train and test."""
     content, path = file.content, file.path
     lists = {split: content[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in content}
     if not lists:
         lists = {
-            split: [each.view.name for each in found if split in PurePosixPath(_plain(each.name)).parts[:-1]]
+            split: [each.view.name for each in frames if split in PurePosixPath(_plain(each.name)).parts[:-1]]
             for split in SPLITS
         }
         if not lists["train"] or not (lists["val"] or lists["test"]):
             return None
     # As written in the frames, too: without an extension, say.
-    numbers = {name: n for n, each in enumerate(found) for name in (each.view.name, _plain(each.name))}
+    numbers = {name: n for n, each in enumerate(frames) for name in (each.view.name, _plain(each.name))}
     listed_at_all = {_plain(frame.get("file_path")) for frame in file.frames if isinstance(frame, dict)}
     splits: dict[str, tuple[int, ...]] = {}
     for split in SPLITS:
@@ -243,11 +243,15 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
         splits[split] = tuple(dict.fromkeys(numbers[_plain(name)] for name in names if _plain(name) in numbers))
     if "train" not in lists:
         held = {*splits["val"], *splits["test"]}
-        splits["train"] = tuple(number for number in range(len(found)) if number not in held)
-    unused = [each.view.name for number, each in enumerate(found) if all(number not in splits[key] for key in SPLITS)]
+        splits["train"] = tuple(number for number in range(len(frames)) if number not in held)
+    unused = [each.view.name for number, each in enumerate(frames) if all(number not in splits[key] for key in SPLITS)]
     if unused:
         log.warning(
-            "%s: %d of %d views are in no split, and are not used: %s", path, len(unused), len(found), listed(unused, 3)
+            "%s: %d of %d views are in no split, and are not used: %s",
+            path,
+            len(unused),
+            len(frames),
+            listed(unused, 3),
         )
     return splits
 

@@ -159,10 +159,10 @@ def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Pat
 def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
     """Return what to do differently, if anything."""
     lines = []
-    if model.apart:
+    if model.disconnected:
         lines.append(
-            f"{listed(model.apart, 4)} fit together but not with the rest: if they show another place, make a separate "
-            "capture of them; if not, photographs between the two are missing."
+            f"{listed(model.disconnected, 4)} fit together but not with the rest: if they show another place, make "
+            "a separate capture of them; if not, photographs between the two are missing."
         )
     if len(model.registered) < ENOUGH * (len(model.registered) + len(model.left_out)):
         more = (

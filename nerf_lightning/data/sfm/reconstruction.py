@@ -48,7 +48,7 @@ class SparseModel:
 
     registered: tuple[str, ...]
     left_out: tuple[str, ...]
-    apart: tuple[str, ...]
+    disconnected: tuple[str, ...]
     """Left-out photographs that were registered only with each other, such as those of another place."""
     num_points: int
     num_cameras: int
@@ -104,7 +104,7 @@ def in_short(models: list[Any], names: list[str]) -> SparseModel:
     return SparseModel(
         registered=tuple(name for name in names if name in registered),
         left_out=tuple(name for name in names if name not in registered),
-        apart=tuple(name for name in names if name not in registered and any(name in other for other in others)),
+        disconnected=tuple(name for name in names if name not in registered and any(name in other for other in others)),
         num_points=model.num_points3D(),
         num_cameras=model.num_cameras(),
         reprojection_error=model.compute_mean_reprojection_error(),
@@ -281,10 +281,10 @@ def _mapped_globally(
     return _largest_first(colmap.global_mapping(database, folder, make_folder(models), options))
 
 
-def _largest_first(found: dict[int, Any]) -> list[Any]:
-    for model in found.values():
+def _largest_first(reconstructions: dict[int, Any]) -> list[Any]:
+    for model in reconstructions.values():
         for image in [model.image(number) for number in model.reg_image_ids()]:
             if image.num_points3D < FEWEST_POINTS:
                 model.deregister_frame(image.frame_id)
-    models = [model for model in found.values() if model.num_reg_images() >= FEWEST_REGISTERED]
+    models = [model for model in reconstructions.values() if model.num_reg_images() >= FEWEST_REGISTERED]
     return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)

@@ -97,11 +97,13 @@ def frame_stride(num_frames: int, every: int | None) -> int:
     return every or max(1, num_frames // FRAMES_WANTED)
 
 
-def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[int], None] = lambda count: None) -> int:
+def write_sharp_frames(
+    video: Path, folder: Path, every: int, on_frame: Callable[[int], None] = lambda count: None
+) -> int:
     """Write the sharpest of every `every` frames as frame_000123.jpg, by its number in the video; return the count.
 
-    Frames are upright, and tone-mapped if the film is HDR; a shorter last group counts as one; `seen` is called with
-    the number of frames read so far.
+    Frames are upright, and tone-mapped if the film is HDR; a shorter last group counts as one; `on_frame` gets the
+    number of frames read so far.
 
     Raises:
         InputError: the file is not a video, or has no frames.
@@ -113,7 +115,7 @@ def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[in
         # Only the best frame so far is kept: a group of large frames would take gigabytes.
         if (here := sharpness(frame)) > sharpest:
             sharpest, best, number = here, frame, index
-        seen(index + 1)
+        on_frame(index + 1)
         if (index + 1) % every == 0:
             written, sharpest = written + _write(folder, best, number, transfer), -1.0
     if sharpest >= 0:

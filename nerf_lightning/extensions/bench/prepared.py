@@ -53,7 +53,7 @@ class Bench:
     @cached_property
     def batch(self) -> Batch:
         """The batch for every kind, with the batch size of a trained model."""
-        return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
+        return self.batches.batch_at(0, self.batches.crop_rays(0)).to(self.settings.device)
 
     def train(self, steps: int) -> None:
         """Take steps on the one batch."""
@@ -85,7 +85,7 @@ class Bench:
     def take_step(self) -> None:
         """Take one step of training, including loading."""
         progress = self.batches.progress
-        batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
+        batch = self.batches.batch_at(progress.attempt, progress.rays_seen).to(self.settings.device)
         self.train_step(batch, self.optimizer)
 
     def render(self, num_rays: int, plain: bool = False) -> None:

@@ -66,7 +66,7 @@ def mesh_of_depth(
     np.negative(distance, out=distance)
     vertices, faces = marching_cubes(distance, 0.0, report)
     del distance
-    faces = faces[_known(vertices, faces, weight)]
+    faces = faces[_observed_faces(vertices, faces, weight)]
     if not len(faces):
         raise InputError(
             f"No surface of {for_terminal(record.name)} is seen well enough to be a mesh: all of it is seen only at "
@@ -75,7 +75,7 @@ def mesh_of_depth(
     return lattice.to_scene(vertices), faces
 
 
-def _known(
+def _observed_faces(
     vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], weight: Float[ndarray, "x y z"]
 ) -> ndarray:
     """Return which faces are in cells whose eight corners are known: elsewhere the surface would be made up."""

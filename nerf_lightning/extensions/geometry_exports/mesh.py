@@ -175,7 +175,7 @@ class MeshExport(Export):
         points: Float[Tensor, "vertices 3"],
         faces: Int[ndarray, "faces 3"],
         normals: Float[Tensor, "vertices 3"],
-        **look: ndarray,
+        **appearance: ndarray,
     ) -> list[Path]:
         """Write a mesh in the scene's frame to files in the user's frame."""
         to_user = record.to_user.double()
@@ -183,7 +183,9 @@ class MeshExport(Export):
         placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
         frame = GltfFrame(up.numpy(), record.metres_per_unit or 1.0)
         save = save_textured_mesh if self.texture else save_mesh
-        return save(child_of(folder, f"mesh.{self.format}"), placed.numpy(), faces, turned.numpy(), frame=frame, **look)
+        return save(
+            child_of(folder, f"mesh.{self.format}"), placed.numpy(), faces, turned.numpy(), frame=frame, **appearance
+        )
 
     def _surface(
         self,

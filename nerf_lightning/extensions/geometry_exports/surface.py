@@ -97,23 +97,23 @@ def surface_colors(
 
 def short_rays(
     model: Model,
-    at: Float[Tensor, "points 3"],
-    look: Float[Tensor, "points 3"],
+    points: Float[Tensor, "points 3"],
+    directions: Float[Tensor, "points 3"],
     before: float,
-    behind: float,
+    after: float,
     samples: int,
     closed: bool,
 ) -> DenseRendering:
-    """Return what rays along unit directions see from `before` points to `behind` them, using only the last level.
+    """Return what rays along unit directions see from `before` points to `after` them, using only the last level.
 
     Everything is in the scene's frame and units; `closed` says whether the remaining light ends there, or continues.
     """
-    edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
-    intervals, origins = RaySamples(edges), at - before * look
-    positions = origins[:, None] + intervals.midpoints[..., None] * look[:, None]
-    output = point_field(model).query(Points(positions, look[:, None]))
-    near, beyond = torch.zeros(len(at), device=at.device), None if closed else torch.zeros_like(at)
-    return composite(output, intervals, RayBundle(origins, look, near, near + before + behind, look), beyond)
+    edges = torch.linspace(0.0, before + after, samples + 1, device=points.device).expand(len(points), samples + 1)
+    intervals, origins = RaySamples(edges), points - before * directions
+    positions = origins[:, None] + intervals.midpoints[..., None] * directions[:, None]
+    output = point_field(model).query(Points(positions, directions[:, None]))
+    near, beyond = torch.zeros(len(points), device=points.device), None if closed else torch.zeros_like(points)
+    return composite(output, intervals, RayBundle(origins, directions, near, near + before + after, directions), beyond)
 
 
 NEAREST = 3  # Cameras per point.

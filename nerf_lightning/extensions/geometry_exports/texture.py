@@ -37,7 +37,7 @@ BYTES_PER_TEXEL = 100
 # Rays of texels begin this many times the reach before the surface, with this many samples: nearer, haze after a short
 # training is painted too light; farther costs more without visible gain.
 BEFORE, SAMPLES = 4.0, 20
-TOGETHER = 1 << 16  # Texels per chunk; progress is reported after each.
+CHUNK_TEXELS = 1 << 16  # Texels per chunk; progress is reported after each.
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class TextureMaker:
         scores = self.vertex_scores(report)
         colors = torch.zeros(len(texels.row), 3)
         seen = torch.zeros(len(texels.row), dtype=torch.bool)
-        for part in tiles(len(texels.row), TOGETHER):
+        for part in tiles(len(texels.row), CHUNK_TEXELS):
             colors[part], seen[part] = self._colors(texels, part, scores)
             report("texels", part.stop / max(1, len(texels.row)))
         if not seen.any():
@@ -179,12 +179,12 @@ class TextureMaker:
                 weight[here] += share[some] * seen.opacity.cpu()
         return light / weight.clamp(min=torch.finfo(weight.dtype).tiny)[:, None], weight > LEAST_SEEN
 
-    def _arriving(self, at: Float[Tensor, "points 3"], view: int) -> Float[Tensor, "points"]:
+    def _arriving(self, points: Float[Tensor, "points 3"], view: int) -> Float[Tensor, "points"]:
         """Return the share of the light from each place that reaches a view."""
         record = self.record
-        way = at - record.cameras.c2w[view, :, 3]
+        way = points - record.cameras.c2w[view, :, 3]
         distance = way.norm(dim=-1)
-        directions, origins = way / distance[:, None], record.cameras.c2w[view, :, 3].expand(at.shape)
+        directions, origins = way / distance[:, None], record.cameras.c2w[view, :, 3].expand(points.shape)
         end = distance - self.reach
         near = torch.minimum(record.near[view], end).clamp(min=0.0)
         # Slightly beyond the place, since a ray of zero length would be sampled only at the surface.

@@ -85,13 +85,13 @@ def _colors(
         visible = -np.expm1(-densities[chunk] * lattice.spacing) > LEAST_ALPHA
         kept = torch.from_numpy(np.flatnonzero(visible))
         points = lattice.points(chunk)[kept]
-        parts = [_seen(model, points[part], eyes) for part in tiles(len(points), tile_points)]
+        parts = [_point_colors(model, points[part], eyes) for part in tiles(len(points), tile_points)]
         rgb[chunk.start + kept.numpy()] = torch.cat(parts).numpy()
         report("colors", chunk.stop / lattice.num_points)
     return rgb.reshape(*lattice.shape, 3)
 
 
-def _seen(
+def _point_colors(
     model: Model, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
     device, looks = next(model.parameters()).device, looks_from_nearest(points, eyes)

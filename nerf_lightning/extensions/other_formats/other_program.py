@@ -49,7 +49,7 @@ class OtherProgramReader(PosedReader):
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
         """Return the file by which a format is recognized, if a folder has it, or is that file itself."""
-        found = _known(folder)
+        found = _detect_format(folder)
         return found[1][0] if found else None
 
     def capture(self) -> Capture:
@@ -59,7 +59,7 @@ class OtherProgramReader(PosedReader):
             InputError: the format is unknown, or anything is wrong with the files.
         """
         named, folder = Path(self.root).expanduser(), self.folder()
-        found = _known(named if os.path.isfile(named) else folder)
+        found = _detect_format(named if os.path.isfile(named) else folder)
         if found is None:
             programs = listed((form.program for form in FORMATS), len(FORMATS))
             raise InputError(f"{self.root} holds no cameras of {programs}. Give the folder that does.")
@@ -71,12 +71,12 @@ class OtherProgramReader(PosedReader):
         return form.read(self, path)
 
 
-def _known(place: Path) -> tuple[Format, list[str]] | None:
+def _detect_format(path: Path) -> tuple[Format, list[str]] | None:
     """Return the format of a file or a folder, and the files with its signature, below the folder."""
     for form in FORMATS:
         for signature in form.signatures:
-            if place.is_file() and fits(place, signature):
-                return form, [place.name]
-            if (names := list(files_with(place, signature))) and form.suits(place):
+            if path.is_file() and fits(path, signature):
+                return form, [path.name]
+            if (names := list(files_with(path, signature))) and form.suits(path):
                 return form, names
     return None

@@ -68,7 +68,7 @@ def _seven_scenes(reader: PosedReader, path: Path, size: Size) -> tuple[Pose, In
     pose = from_opencv(first_numbers(path)[:16], str(path))
     info = next((file for folder in path.parents[:2] if (file := folder / "info.txt").is_file()), None)
     if info is None:
-        return pose, reader.given("7-Scenes", size)
+        return pose, reader.user_intrinsics("7-Scenes", size)
     text, found = read_text(info, "text", CURE), list[list[float]]()
     for key, counts in (("calibrationColorIntrinsic", 16), ("colorWidth", 1), ("colorHeight", 1)):
         match = re.search(INFO % key, text)

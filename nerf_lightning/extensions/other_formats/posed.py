@@ -138,7 +138,7 @@ class PosedReader(CaptureReader):
         left_out.require_enough(len(views))
         return of_one_lens(Capture(tuple(views), source, left_out=left_out, **more), kinds)
 
-    def given(self, program: str, size: Size = (1.0, 1.0)) -> Intrinsics:
+    def user_intrinsics(self, program: str, size: Size = (1.0, 1.0)) -> Intrinsics:
         """Return the intrinsics given by the user, for a picture of (width, height) pixels."""
         if self.intrinsics is None or len(self.intrinsics) != 4:
             raise InputError(
@@ -237,11 +237,11 @@ def numbered(key: str, items: list[Item]) -> dict[str, Item]:
     return {f"{key}[{index}]": item for index, item in enumerate(items)}
 
 
-def sparse_points(found: Collection[object], path: Path) -> Float[Tensor, "points 3"]:
+def sparse_points(points: Collection[object], path: Path) -> Float[Tensor, "points 3"]:
     """Return points of three numbers each; if one is broken, none, which is logged."""
-    require_within("points", len(found), path, "points")
+    require_within("points", len(points), path, "points")
     try:
-        rows = [numbers(point, 3, f"{path}: a point") for point in found]
+        rows = [numbers(point, 3, f"{path}: a point") for point in points]
     except InputError as error:
         log.warning("%s: its points are left out. %s", path, error)
         rows = []

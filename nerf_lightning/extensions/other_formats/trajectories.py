@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 def _tum(reader: PosedReader, path: Path) -> Capture:
     """Read time, position and quaternion x y z w per line, for the pictures of rgb.txt (time, name)."""
-    reader.given("TUM")
+    reader.user_intrinsics("TUM")
     poses = sorted((row[0], row) for words in _lines(path).values() if len(row := _floats(words)) == 8)
     times = [time for time, _ in poses]
 
@@ -56,7 +56,7 @@ def _tum(reader: PosedReader, path: Path) -> Capture:
         def camera(size: Size) -> tuple[Pose, Intrinsics]:
             if near is None or abs(near[0] - time) > NEAR_IN_TIME:
                 raise InputError(f"{where} has no pose within {NEAR_IN_TIME:g} s. Remove it, or record its pose.")
-            return _from_quaternion(near[1][1:4], near[1][4:], where), reader.given("TUM", size)
+            return _from_quaternion(near[1][1:4], near[1][4:], where), reader.user_intrinsics("TUM", size)
 
         return Posed(words[1], where, camera)
 
@@ -78,7 +78,7 @@ def _replica(reader: PosedReader, path: Path) -> Capture:
                 raise InputError(f"{where}: {picture.name} has no line in {path.name}, which has {len(lines)}. {CURE}")
             pose = from_opencv(numbers(lines[index], 16, f"{where}, line {index + 1}"), f"{where}, line {index + 1}")
             if said is None:
-                return pose, reader.given("Replica without cam_params.json", size)
+                return pose, reader.user_intrinsics("Replica without cam_params.json", size)
             w, h, fx, fy, cx, cy = (number(said, key, str(params)) for key in ("w", "h", "fx", "fy", "cx", "cy"))
             return pose, Intrinsics((fx, fy), (cx, cy), (w, h))
 
@@ -96,7 +96,7 @@ def _replica(reader: PosedReader, path: Path) -> Capture:
 def _tanks(reader: PosedReader, path: Path) -> Capture:
     """Read blocks of three numbers and a matrix, one per picture, in order."""
     lines, names = list(_lines(path).values()), _in_order(reader.pictures())
-    reader.given("Tanks and Temples")
+    reader.user_intrinsics("Tanks and Temples")
     if len(lines) != 5 * len(names):
         raise InputError(
             f"{path} of Tanks and Temples has {len(lines) / 5:g} poses, but {reader.pictures()} has {len(names)} "
@@ -110,7 +110,7 @@ def _tanks(reader: PosedReader, path: Path) -> Capture:
             where,
             lambda size: (
                 from_opencv(numbers(rows, 16, where), where),
-                reader.given("Tanks and Temples", size),
+                reader.user_intrinsics("Tanks and Temples", size),
             ),
         )
 

@@ -36,20 +36,20 @@ def mean_activity(
     Raises:
         InputError: a field is never evaluated.
     """
-    asked: list[tuple[str, Points]] = []
+    queries: list[tuple[str, Points]] = []
     sums: dict[str, list[Tensor]] = {}
     counts = dict.fromkeys(fields, 0)
     tiles = weighted_renderings(model, _rays(scene, key), scene.background, key, tile_points)
     while True:
-        with _written_down(fields, asked):
+        with _written_down(fields, queries):
             if next(tiles, None) is None:
                 break
-        for name, points in asked:
+        for name, points in queries:
             found = [layer.abs().flatten(0, -2) for layer in fields[name].hidden_activations(points)]
             parts = [layer.sum(dim=0, dtype=torch.float64) for layer in found]
             counts[name] += found[0].shape[0]
             sums[name] = [a + b for a, b in zip(sums[name], parts, strict=True)] if name in sums else parts
-        asked.clear()
+        queries.clear()
     unasked = [name for name, count in counts.items() if not count]
     if unasked:
         raise InputError(
@@ -60,17 +60,17 @@ def mean_activity(
 
 
 @contextmanager
-def _written_down(fields: Mapping[str, Field], asked: list[tuple[str, Points]]) -> Iterator[None]:
+def _written_down(fields: Mapping[str, Field], queries: list[tuple[str, Points]]) -> Iterator[None]:
     """Record the points at which fields are evaluated, for density alone or color."""
     hooks = []
     for name, field in fields.items():
 
-        def density(points: Points, name: str = name, known: Any = field.density) -> Any:
-            asked.append((name, points))
-            return known(points)
+        def density(points: Points, name: str = name, original: Any = field.density) -> Any:
+            queries.append((name, points))
+            return original(points)
 
         def before(_: Any, inputs: tuple[Any, ...], name: str = name) -> None:
-            asked.append((name, inputs[0]))
+            queries.append((name, inputs[0]))
 
         field.density = density  # type: ignore[method-assign]
         hooks.append(field.register_forward_pre_hook(before))

@@ -41,7 +41,7 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
     if not (folder / ".hydra" / "overrides.yaml").is_file():
         raise InputError(
             f"finetune_steps={steps}: {folder} has no .hydra/overrides.yaml, which says how {checkpoint.path.name} was "
-            f"trained. Leave it out, and fine-tune with nerf train, the run's settings, {_told(widths)} and "
+            f"trained. Leave it out, and fine-tune with nerf train, the run's settings, {_format_widths(widths)} and "
             "init_from=CHECKPOINT."
         )
     # What a run does only at its start, showing the pictures' centers first, is for untrained weights.
@@ -74,5 +74,5 @@ def _setting(model: Any, field: str) -> str:
     return f"{node[2:-1]}.width" if isinstance(node, str) else f"model.{field}.width"
 
 
-def _told(widths: Mapping[str, int]) -> str:
+def _format_widths(widths: Mapping[str, int]) -> str:
     return ", ".join(f"model.{name}.width={width}" for name, width in widths.items()) or "the same widths"

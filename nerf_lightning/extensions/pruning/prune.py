@@ -73,11 +73,11 @@ def prune(
     for name, field in fields.items():
         prefix = f"{name}."
         own = {key.removeprefix(prefix): tensor for key, tensor in state.items() if key.startswith(prefix)}
-        kept = {}
+        selections = {}
         for number, layer in enumerate(field.hidden_layers()):
             count = shapes[prefix + layer.rows[0]].shape[0]
             activity = active[name][number] if name in active else None
             draw = fold(key, name, number)
-            kept[layer] = choose(neurons_of(own, layer), count, pruning.by, pruning.weights, activity, draw)
-        state |= {prefix + key: tensor for key, tensor in narrowed(own, kept).items()}
+            selections[layer] = choose(neurons_of(own, layer), count, pruning.by, pruning.weights, activity, draw)
+        state |= {prefix + key: tensor for key, tensor in narrowed(own, selections).items()}
     return state

@@ -19,7 +19,7 @@ def quantize_rows(
     table: Float[Tensor, "..."],
     number: NumberType,
     starts: Sequence[int] = (0,),
-    kept: Bool[Tensor, "rows"] | None = None,
+    mask: Bool[Tensor, "rows"] | None = None,
 ) -> dict[str, Any]:
     """Return a quantized table: int8 is in units of its block's largest magnitude over 127.
 
@@ -27,20 +27,20 @@ def quantize_rows(
         table: rows of features along the last axis; with more than two axes, each number is a row.
         number: the type in which its numbers are stored.
         starts: the first row of each of its blocks (a hash grid's levels).
-        kept: the rows to keep; the others are restored as the mean of their block's kept rows. None: all.
+        mask: the rows to keep; the others are restored as the mean of their block's kept rows. None: all.
     """
     rows = table.detach().float().cpu()
     rows = rows if rows.ndim == 2 else rows.reshape(-1, 1)
-    kept = torch.ones(rows.shape[0], dtype=torch.bool) if kept is None else kept
+    mask = torch.ones(rows.shape[0], dtype=torch.bool) if mask is None else mask
     ends = [*starts[1:], rows.shape[0]]
-    blocks = [(rows[a:b][kept[a:b]], rows[a:b][~kept[a:b]]) for a, b in zip(starts, ends, strict=True)]
+    blocks = [(rows[a:b][mask[a:b]], rows[a:b][~mask[a:b]]) for a, b in zip(starts, ends, strict=True)]
     largest = torch.stack([inside.abs().max() if inside.numel() else torch.tensor(0.0) for inside, _ in blocks])
     scales = torch.where(largest > 0, largest / LARGEST_INT8, 1.0) if number == "int8" else torch.ones_like(largest)
-    values = rows[kept] / scales[block_of(starts, rows.shape[0])[kept], None]
+    values = rows[mask] / scales[block_of(starts, rows.shape[0])[mask], None]
     return {
         "shape": list(table.shape),
         "starts": list(starts),
-        "kept": None if bool(kept.all()) else to_bits(kept),
+        "kept": None if bool(mask.all()) else to_bits(mask),
         "values": (values.round() if number == "int8" else values).to(TYPES[number]),
         "scales": scales,
         "means": torch.stack([left.sum(0) / max(1, left.shape[0]) for _, left in blocks]),

@@ -63,7 +63,7 @@ def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dic
         rows[f"model.{name}.table"] = quantize_rows(encoder.table, tables, starts, reached.get(name))
     for name, grid in grids.items() if drop_empty else ():
         kept = grid.cells.flatten().bool()
-        rows[f"model.{name}.density"] = quantize_rows(grid.density, "float32", kept=kept)
+        rows[f"model.{name}.density"] = quantize_rows(grid.density, "float32", mask=kept)
         switches |= {f"model.{name}.{each}": quantize_switches(getattr(grid, each)) for each in SWITCHES}
     return {"rows": rows, "switches": switches}
 

@@ -26,7 +26,7 @@ class Neurons:
 
 
 @dataclass(frozen=True)
-class Kept:
+class Selection:
     """The neurons of a layer to keep."""
 
     numbers: Int[Tensor, "kept"]
@@ -37,7 +37,7 @@ class Kept:
 
 def choose(
     layer: Neurons, count: int, by: By, weights: Side, activity: Float[Tensor, "neurons"] | None, key: int
-) -> Kept:
+) -> Selection:
     """Return the neurons of a layer to keep; if all are kept, they stay unchanged.
 
     Args:
@@ -51,7 +51,7 @@ def choose(
     """
     there = layer.incoming.shape[0]
     if count >= there:
-        return Kept(torch.arange(there))
+        return Selection(torch.arange(there))
     if by == "coreset":
         return coreset(layer, count, _uniform(key, count))
     if by == "random":
@@ -74,7 +74,7 @@ def importance(layer: Neurons, weights: Side) -> Float[Tensor, "neurons"]:
     return sides[weights].mean(dim=0)
 
 
-def coreset(layer: Neurons, count: int, uniform: Float[Tensor, "draws"]) -> Kept:
+def coreset(layer: Neurons, count: int, uniform: Float[Tensor, "draws"]) -> Selection:
     """Draw neurons with replacement, and weight them so that the next layer's sums stay the same in expectation.
 
     p ~ max|w_out| phi(b |w_in|), m draws, and the weight count / (m p) (Mussay et al., ICLR 2020, arXiv 1907.04018).
@@ -96,11 +96,11 @@ def coreset(layer: Neurons, count: int, uniform: Float[Tensor, "draws"]) -> Kept
     order = torch.argsort((counts > 0) * 2.0 + p, descending=True, stable=True)
     numbers = order[:count].sort().values
     factors = torch.where(counts > 0, counts / (uniform.numel() * p.clamp(min=torch.finfo(p.dtype).tiny)), 0.0)
-    return Kept(numbers, factors[numbers].to(layer.outgoing.dtype))
+    return Selection(numbers, factors[numbers].to(layer.outgoing.dtype))
 
 
-def _largest(scores: Tensor, count: int) -> Kept:
-    return Kept(torch.argsort(scores, descending=True, stable=True)[:count].sort().values)
+def _largest(scores: Tensor, count: int) -> Selection:
+    return Selection(torch.argsort(scores, descending=True, stable=True)[:count].sort().values)
 
 
 def _uniform(key: int, count: int) -> Float[Tensor, "count"]:
@@ -115,10 +115,10 @@ def neurons_of(state: Mapping[str, Tensor], layer: HiddenLayer) -> Neurons:
     return Neurons(torch.cat([matrix, *bias], dim=1), torch.cat(readers))
 
 
-def narrowed(state: Mapping[str, Tensor], kept: Mapping[HiddenLayer, Kept]) -> dict[str, Tensor]:
+def narrowed(state: Mapping[str, Tensor], selections: Mapping[HiddenLayer, Selection]) -> dict[str, Tensor]:
     """Return a field's state with the kept neurons, in their original order."""
     narrow = dict(state)
-    for layer, stays in kept.items():
+    for layer, stays in selections.items():
         there = state[layer.rows[0]].shape[0]
         for name in layer.rows:
             narrow[name] = narrow[name].index_select(0, stays.numbers)

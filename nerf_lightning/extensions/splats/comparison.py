@@ -42,7 +42,7 @@ class Comparison:
 
 
 def compared(
-    found: FittedSplats,
+    fitted: FittedSplats,
     gaussians: Gaussians,
     model: Model,
     background: Background,
@@ -51,7 +51,7 @@ def compared(
     report: Report,
 ) -> Comparison:
     """Render held-out views, or else training views, with `gaussians`, which may be rounded, and with the field."""
-    scene, pinholes = found.scene, found.pinholes
+    scene, pinholes = fitted.scene, fitted.pinholes
     split = next(name for name in ("test", "val", "train") if scene.splits.get(name))
     views = evenly_spaced_subset(scene.splits[split], max_views)
     behind = color_behind(background)
@@ -63,7 +63,7 @@ def compared(
         truth, kept = field, None
         if isinstance(scene, Scene):
             taken = photographed(scene, view, pinholes)
-            truth, kept = taken.over(behind), taken.kept
+            truth, kept = taken.over(behind), taken.mask
             of_field.append(image_metrics(field, truth, kept))
         of_splats.append(image_metrics(splats, truth, kept))
         named = [("photograph", truth)] if isinstance(scene, Scene) else []

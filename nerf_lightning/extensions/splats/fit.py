@@ -101,7 +101,7 @@ class _State:
         on_screen = torch.zeros(len(self.gaussians), 2, requires_grad=True)
         picture = rasterize(self.gaussians, view.camera, background, on_screen)
         error = picture - view.over(background)
-        error = error if view.kept is None else error[view.kept]
+        error = error if view.mask is None else error[view.mask]
         loss = error.square().mean()
         loss.backward()
         assert on_screen.grad is not None

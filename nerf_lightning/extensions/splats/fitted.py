@@ -149,7 +149,7 @@ def training_views(record: SceneRecord, scene: Scene, pinholes: Cameras, neutral
             rgb = neutral(view.rgba[..., :3] / 255.0, scene.view_names[number])
             assert rgb is not None  # otherwise nothing is fitted to photographs
             view = replace(view, rgba=torch.cat([to_bytes(rgb), view.rgba[..., 3:]], dim=-1))
-        if view.kept is None or bool(view.kept.any()):
+        if view.mask is None or bool(view.mask.any()):
             views.append(view)
     return views
 

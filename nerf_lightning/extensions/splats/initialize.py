@@ -41,30 +41,30 @@ class Surroundings:
 
     cameras: Cameras
     near: float
-    seen: list[SeenView]
+    renders: list[SeenView]
 
     def views(self) -> list[View]:
         """Return pictures to fit to, with the field's opacity as alpha."""
-        cameras = [Pinhole.of(self.cameras, view, self.near) for view in range(len(self.seen))]
-        return [View(camera, _rgba(seen)) for camera, seen in zip(cameras, self.seen, strict=True)]
+        cameras = [Pinhole.of(self.cameras, view, self.near) for view in range(len(self.renders))]
+        return [View(camera, _rgba(seen)) for camera, seen in zip(cameras, self.renders, strict=True)]
 
 
 def look_around(model: Model, record: SceneRecord, tile_points: int, seed: int, report: Report) -> Surroundings:
     """Render the field from positions around the training views."""
     pinholes, views = without_lens(record.cameras, LONGEST), list(record.splits["train"])
     wider = torch.tensor([WIDER, WIDER if record.space == "bounded" else WIDEST]).repeat(COUNT // 2)
-    cameras = _between(pinholes, views, torch.Generator().manual_seed(seed))
+    cameras = _interpolated_cameras(pinholes, views, torch.Generator().manual_seed(seed))
     cameras = replace(cameras, focal=cameras.focal / wider[:, None])
     near, far = (torch.full((COUNT,), float(each[views].mean())) for each in (record.near, record.far))
     around = replace(record, cameras=cameras, near=near, far=far, background="black")
-    seen = []
+    renders = []
     for view in range(COUNT):
-        seen.append(see(model, around, cameras, view, tile_points))
+        renders.append(see(model, around, cameras, view, tile_points))
         report("surfaces", (view + 1) / COUNT)
-    return Surroundings(cameras, float(near[0]), seen)
+    return Surroundings(cameras, float(near[0]), renders)
 
 
-def _between(cameras: Cameras, views: Sequence[int], generator: torch.Generator) -> Cameras:
+def _interpolated_cameras(cameras: Cameras, views: Sequence[int], generator: torch.Generator) -> Cameras:
     # Axes are interpolated like centers, then projected to the nearest rotation by SVD.
     order = torch.randperm(max(COUNT, len(views)), generator=generator)[:COUNT].tolist()
     chosen, others = [views[k % len(views)] for k in order], []
@@ -88,9 +88,9 @@ def initial_gaussians(
     Raises:
         InputError: no pixel sees a surface.
     """
-    numbers, clouds = list(range(len(around.seen))), []
-    depths = {view: seen.surface_depth(min_opacity) for view, seen in enumerate(around.seen)}
-    for view, seen in enumerate(around.seen):
+    numbers, clouds = list(range(len(around.renders))), []
+    depths = {view: seen.surface_depth(min_opacity) for view, seen in enumerate(around.renders)}
+    for view, seen in enumerate(around.renders):
         kept = depths[view].isfinite() & seen.points.isfinite().all(dim=-1)
         points, rgb = seen.points[kept], _rgba(seen)[kept][:, :3] / 255.0
         others = nearest_views(around.cameras, view, numbers, NEAREST)
@@ -98,7 +98,7 @@ def initial_gaussians(
         clouds.append(torch.cat([points, seen.normals[kept], rgb], dim=-1)[agreeing])
     cloud = torch.cat(clouds)
     if len(cloud) <= NEIGHBOURS:
-        most = max(float(seen.opacity.max()) for seen in around.seen)
+        most = max(float(seen.opacity.max()) for seen in around.renders)
         raise InputError(
             f"There is no surface to put splats on: the field's opacity is at most {most:.3g} in {len(numbers)} views, "
             f"and min_opacity={min_opacity:g} is needed in two that agree. Train longer, or lower it."
@@ -108,8 +108,8 @@ def initial_gaussians(
     return _flat_gaussians(points, normals, rgb, sh_degree)
 
 
-def _rgba(seen: SeenView) -> Tensor:
-    return straight_colors(seen.rgb.minimum(seen.opacity[..., None]), seen.opacity)
+def _rgba(render: SeenView) -> Tensor:
+    return straight_colors(render.rgb.minimum(render.opacity[..., None]), render.opacity)
 
 
 def _flat_gaussians(

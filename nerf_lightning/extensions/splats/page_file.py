@@ -36,7 +36,7 @@ SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
 SHADERS = ("splats.vert", "splats.frag")
 NEAR_NDC = 0.2  # Share of the distance at which content begins.
 INSIDE = 0.01  # Share of the splats beyond either side of the box around which the view orbits.
-BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
+BACKGROUND_COLORS: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 STILL, PHOTOGRAPH = 640, 320  # Longer side in pixels of the still picture, and of photographs.
 JPEG_QUALITY = 80
 PART_OF_PANORAMA = 1.5  # Field of view around a panorama's direction, in radians.
@@ -105,7 +105,7 @@ def write_page(
         "facts": [("scene", record.name), *run.facts, *facts],
         "views": [_view(record, run, view if max_photographs else None) for view in views],
         "still": _jpeg(_still(shown, record, first), STILL),
-        "background": BEHIND[at_evaluation(record.background)],
+        "background": BACKGROUND_COLORS[at_evaluation(record.background)],
     }
     style, vertices, pixels, *scripts = (
         (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", *SHADERS, *SCRIPTS)

@@ -46,8 +46,8 @@ def read_marks(path: Path | None, record: SceneRecord) -> Marks:
     return found
 
 
-def _is_list(given: Any) -> bool:
-    return isinstance(given, list) and all(isinstance(each, dict) for each in given)
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, dict) for each in value)
 
 
 def _require(value: Any, key: str, where: str) -> None:

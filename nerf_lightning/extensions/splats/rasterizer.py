@@ -55,12 +55,12 @@ class _Rasterize(torch.autograd.Function):
         sorted_splats = tiles.sort_into_tiles(tiles.nearest_first(screen), screen, across, down)
         behind = background.detach().float().contiguous().numpy()
         _over_tiles(tiles.blend, across * down, across, screen, *sorted_splats, behind, picture)
-        ctx.kept = splats, taken, screen, across, sorted_splats, picture
+        ctx.saved = splats, taken, screen, across, sorted_splats, picture
         return torch.from_numpy(picture)[: camera.height, : camera.width]
 
     @staticmethod
     def backward(ctx: Any, *grad: Tensor) -> Any:
-        splats, taken, screen, across, (numbers, starts), picture = ctx.kept
+        splats, taken, screen, across, (numbers, starts), picture = ctx.saved
         gradient = np.zeros_like(picture)
         height, width, _ = grad[0].shape
         gradient[:height, :width] = grad[0].numpy()

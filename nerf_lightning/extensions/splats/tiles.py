@@ -28,7 +28,7 @@ from nerf_lightning.extensions.splats.projection import (
 
 SIDE = 16
 AREA = SIDE * SIDE
-LOOK = 16  # Number of splats after which a tile checks whether it is opaque.
+CHECK_EVERY = 16  # Number of splats after which a tile checks whether it is opaque.
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LEAST, LARGEST, DARK = np.float32(LEAST_ALPHA), np.float32(LARGEST_ALPHA), np.float32(LEAST_LIGHT)
 # exp(-8 u) = p(u)^8 for u in [0, 1], to 2e-7: a polynomial vectorizes, the library's function does not.
@@ -116,7 +116,7 @@ def blend(first, last, across, screen, splats, starts, background, picture):
         x0, y0 = tile % across * SIDE, tile // across * SIDE
         px[:AREA], px[AREA:] = ONE, ZERO
         for k in range(starts[tile], starts[tile + 1]):
-            if (k - starts[tile]) % LOOK == LOOK - 1 and _is_dark(px):
+            if (k - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _is_dark(px):
                 break
             mean_x, mean_y, a, b, c, opacity, red, green, blue, top, bottom = _splat(screen[splats[k]], x0, y0)
             for y in range(top, bottom + 1):
@@ -160,7 +160,7 @@ def blend_back(first, last, across, screen, splats, starts, picture, gradient, p
                     behind += g * picture[y0 + y, x0 + x, c]
                 px[at + AREA] = behind
         for k in range(starts[tile], starts[tile + 1]):
-            if (k - starts[tile]) % LOOK == LOOK - 1 and _is_dark(px):
+            if (k - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _is_dark(px):
                 break
             mean_x, mean_y, a, b, c, opacity, red, green, blue, top, bottom = _splat(screen[splats[k]], x0, y0)
             of_opacity = of_x = of_y = of_a = of_b = of_c = of_red = of_green = of_blue = ZERO

@@ -25,7 +25,7 @@ class View:
     camera: Pinhole
     rgba: UInt8[Tensor, "height width 4"]
     """Straight alpha."""
-    kept: Bool[Tensor, "height width"] | None = None
+    mask: Bool[Tensor, "height width"] | None = None
     """Pixels that count; None: all."""
 
     def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "height width 3"]:

@@ -180,7 +180,7 @@ class ViewTransformer(Model):
         samples = self._samples(rays, random)
         of_ray = sources.views[sources.target]
         projected = project_samples(photographs.cameras, tables.least_cosine, of_ray, rays, samples.midpoints)
-        visible = projected.visible & sources.given[sources.target][:, None]
+        visible = projected.visible & sources.valid[sources.target][:, None]
         projected = replace(projected, visible=visible)
         views = self._looked_up(tables, sources, projected)
         states = self.begin(views)
@@ -232,8 +232,8 @@ class ViewTransformer(Model):
         views, numbered = torch.unique(sources.views, return_inverse=True)
         numbers = views.tolist()
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
-        features = tables.features(views, numbers, self.image_network).look_up(view, projected.at)
-        colors = tables.colors(views, numbers).look_up(view, projected.at)
+        features = tables.features(views, numbers, self.image_network).look_up(view, projected.xy)
+        colors = tables.colors(views, numbers).look_up(view, projected.xy)
         return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.turned, projected.visible)
 
     def _warn_of_unseen(self, opacity: Float[Tensor, "rays"]) -> None:

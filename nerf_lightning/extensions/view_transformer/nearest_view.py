@@ -54,16 +54,16 @@ class NearestViews:
         # A single source is the nearest; several are sorted from nearest to farthest.
         sources = choose_sources(photographs, rays, self.count, None)
         views = sources.views[sources.target]
-        at = torch.stack([pixels.x, pixels.y], dim=-1).flatten(0, 1) + 0.5
-        as_is = self._colors(views, at[:, None].expand(-1, views.shape[1], -1))
+        xy = torch.stack([pixels.x, pixels.y], dim=-1).flatten(0, 1) + 0.5
+        as_is = self._colors(views, xy[:, None].expand(-1, views.shape[1], -1))
         axis = -self.cameras.c2w[view, :, 2]
         ahead = ((photographs.middle[capture] - rays.origins) * axis).sum(dim=-1)
         t = (ahead / (rays.directions * axis).sum(dim=-1).clamp(min=1e-6)).clamp(min=1e-6)
         seen = project_samples(photographs.cameras, self.tables.least_cosine, views, rays, t[:, None])
-        on_plane, there = self._colors(views, seen.at[:, 0]), seen.visible[:, 0]
+        on_plane, there = self._colors(views, seen.xy[:, 0]), seen.visible[:, 0]
         apart = squared_distances(photographs, capture, rays.origins, views)
         weights = 1.0 / (apart / apart.amin(dim=1, keepdim=True).clamp(min=1e-12) + SHARPNESS)
-        weights, everywhere = weights * sources.given[sources.target], torch.ones_like(there)
+        weights, everywhere = weights * sources.valid[sources.target], torch.ones_like(there)
         found = [
             _mean(colors, kept)
             for colors, visible in ((as_is, everywhere), (on_plane, there))
@@ -71,9 +71,9 @@ class NearestViews:
         ]
         return {kind: picture.view(*shape, 3) for kind, picture in zip(KINDS, found, strict=True)}
 
-    def _colors(self, views: Tensor, at: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
+    def _colors(self, views: Tensor, xy: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
         used, numbered = torch.unique(views, return_inverse=True)
-        return self.tables.colors(used, used.tolist()).look_up(numbered, at)
+        return self.tables.colors(used, used.tolist()).look_up(numbered, xy)
 
 
 def _mean(colors: Float[Tensor, "rays sources 3"], weights: Tensor) -> Float[Tensor, "rays 3"]:

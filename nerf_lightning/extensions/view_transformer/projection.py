@@ -27,8 +27,8 @@ BEYOND = 1.1
 class Projected(TensorStruct):
     """Points of rays in their source photographs."""
 
-    at: Float[Tensor, "rays samples sources 2"]
-    """In pixels from the upper left corner (x, y); 0 if not visible."""
+    xy: Float[Tensor, "rays samples sources 2"]
+    """In pixels from the upper left corner; 0 if not visible."""
     visible: Bool[Tensor, "rays samples sources"]
     """Whether the point is in the picture."""
     turned: Float[Tensor, "rays samples sources 4"]
@@ -64,13 +64,13 @@ def project_samples(
     ahead = local[..., 2] > least_cosine[views][:, None] * distance
     in_front = torch.where(ahead[..., None], local, torch.eye(3, device=local.device, dtype=local.dtype)[2])
     plane = project_plane(in_front, cameras.lens[views][:, None], cameras.lens_model)
-    at = plane * cameras.focal[views][:, None] + cameras.center[views][:, None]
+    xy = plane * cameras.focal[views][:, None] + cameras.center[views][:, None]
     size = torch.stack([cameras.width[views], cameras.height[views]], dim=-1)[:, None]
-    visible = ahead & ((at >= 0.0) & (at <= size)).all(dim=-1)
+    visible = ahead & ((xy >= 0.0) & (xy <= size)).all(dim=-1)
     looks = rays.directions[:, None, None, :]
     source_looks = (apart[:, None] + t * looks) / distance[..., None]
     turned = torch.cat([looks - source_looks, (looks * source_looks).sum(dim=-1, keepdim=True)], dim=-1)
-    return Projected(torch.where(visible[..., None], at, 0.0), visible, turned)
+    return Projected(torch.where(visible[..., None], xy, 0.0), visible, turned)
 
 
 @disable_autocast

@@ -31,7 +31,7 @@ class SourceViews(TensorStruct):
 
     views: Int[Tensor, "targets sources"]
     """Indices into `Photographs`."""
-    given: Bool[Tensor, "targets sources"]
+    valid: Bool[Tensor, "targets sources"]
     """False if there are no more photographs; the index is then arbitrary."""
     target: Int[Tensor, "rays"]
     """The target of each ray."""
@@ -71,12 +71,12 @@ def choose_sources(photographs: Photographs, rays: RayBundle, count: int, random
         count = max(1, count - MORE_OR_FEWER + int(more * (2 * MORE_OR_FEWER + 1)))
     pool, count = min(max(pool, count), num_views), min(count, num_views)
     nearest = distance.sort(dim=1, stable=True)
-    views, known = nearest.indices[:, :pool], nearest.values[:, :pool].isfinite()
+    views, valid = nearest.indices[:, :pool], nearest.values[:, :pool].isfinite()
     if random is not None:
         of_target = PointRandom(random.key[:1, None], photograph[:, None], photographs.numbers[views])
-        order = torch.where(known, of_target.uniform("sources.order"), torch.inf).argsort(dim=1, stable=True)
-        views, known = views.gather(1, order), known.gather(1, order)
-    return SourceViews(views[:, :count], known[:, :count], of_ray)
+        order = torch.where(valid, of_target.uniform("sources.order"), torch.inf).argsort(dim=1, stable=True)
+        views, valid = views.gather(1, order), valid.gather(1, order)
+    return SourceViews(views[:, :count], valid[:, :count], of_ray)
 
 
 def squared_distances(

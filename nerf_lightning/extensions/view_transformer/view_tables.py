@@ -16,7 +16,7 @@ from nerf_lightning.extensions.view_transformer.projection import seen_cosines
 from nerf_lightning.nerf.rendering.background import background_colors, blend
 from nerf_lightning.nerf.types.photographs import Photographs
 
-KEPT_BYTES = 1 << 28
+CACHE_BYTES = 1 << 28
 """Bytes of colors, and of features, that are cached for the next rays."""
 AT_ONCE = 16
 """Number of pictures that go through the image network together."""
@@ -35,17 +35,17 @@ class ViewTable:
     """Pixels of the photograph per row, along each side."""
 
     def look_up(
-        self, view: Int[Tensor, "*#points"], at: Float[Tensor, "*points 2"]
+        self, view: Int[Tensor, "*#points"], xy: Float[Tensor, "*points 2"]
     ) -> Float[Tensor, "*points channels"]:
         """Return bilinearly interpolated values at places in views; borders are replicated.
 
         Args:
             view: its index in this table.
-            at: pixels of the photograph, from its upper left corner (x, y).
+            xy: pixels of the photograph, from its upper left corner (x, y).
         """
         size = self.size[view]
-        last = (size - 1).expand(at.shape)
-        place = (at / self.scale - 0.5).clamp(min=0.0).minimum(last.to(at))
+        last = (size - 1).expand(xy.shape)
+        place = (xy / self.scale - 0.5).clamp(min=0.0).minimum(last.to(xy))
         low = place.detach().long()
         high = torch.minimum(low + 1, last)
         right, down = (place - low).unbind(dim=-1)
@@ -55,7 +55,7 @@ class ViewTable:
         left, up = 1.0 - right, 1.0 - down
         shares = torch.stack([up * left, up * right, down * left, down * right], dim=-1)
         found = embedding_bag(rows.view(-1, 4), self.rows, mode="sum", per_sample_weights=shares.view(-1, 4))
-        return found.view(*at.shape[:-1], -1)
+        return found.view(*xy.shape[:-1], -1)
 
 
 class ViewTables:
@@ -69,7 +69,7 @@ class ViewTables:
         self.photographs = photographs
         self.least_cosine = seen_cosines(photographs.cameras)
         self.size = torch.stack([photographs.pixels.width, photographs.pixels.height], dim=-1)
-        self._colors, self._features = _Kept(), _Kept()
+        self._colors, self._features = _Cache(), _Cache()
 
     def move_to(self, device: torch.device) -> None:
         """Move everything except the pixels to a device: the host would wait for a copy in each step."""
@@ -118,8 +118,8 @@ class ViewTables:
         return self._colors.get(views, make, device)
 
 
-class _Kept:
-    # A cache of the most recent results, up to `KEPT_BYTES`.
+class _Cache:
+    # A cache of the most recent results, up to `CACHE_BYTES`.
     def __init__(self) -> None:
         self.of: OrderedDict[tuple[int, torch.device], Tensor] = OrderedDict()
         self.state: object = None
@@ -142,7 +142,7 @@ class _Kept:
             for view in views:
                 self.of[view, device] = found[view]
                 self.of.move_to_end((view, device))
-            while sum(each.nbytes for each in self.of.values()) > KEPT_BYTES:
+            while sum(each.nbytes for each in self.of.values()) > CACHE_BYTES:
                 self.of.popitem(last=False)
             return [found[view] for view in views]
 

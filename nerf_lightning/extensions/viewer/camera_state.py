@@ -17,7 +17,7 @@ from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """One requested look of a user; a new request is a new object."""
+    """The camera that a user requests; a new request is a new object."""
 
     c2w: Float[Tensor, "3 4"]
     """Camera to world, columns right, up, back, center; the model's frame."""
@@ -67,19 +67,19 @@ def quaternion_of(c2w: Tensor) -> np.ndarray:
     return quaternion_from_rotation(flip_yz(c2w)[:, :3].double()).numpy()
 
 
-def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:
+def camera_of(state: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:
     """Return a camera for a picture of about this height, with its near and far.
 
     A photograph's camera keeps its aspect ratio, and fits into the window.
     """
-    if look.photograph is not None:
-        view = slice(look.photograph, look.photograph + 1)
+    if state.photograph is not None:
+        view = slice(state.photograph, state.photograph + 1)
         cameras, near, far = record.cameras[view], record.near[view], record.far[view]
-        shrunk = height / max(int(cameras.height), int(cameras.width) * look.height / look.width)
+        shrunk = height / max(int(cameras.height), int(cameras.width) * state.height / state.width)
         sizes = ((size * shrunk).round().long().clamp(min=2) for size in (cameras.width, cameras.height))
         return resized(cameras, *sizes), near, far
-    width = max(2, round(height * look.width / look.height))
-    cameras = pinhole_cameras(look.c2w[None], focal_from_fov(height, look.fov), width, height)
+    width = max(2, round(height * state.width / state.height))
+    cameras = pinhole_cameras(state.c2w[None], focal_from_fov(height, state.fov), width, height)
     if record.cameras.ndc is not None:
         cameras = replace(cameras, ndc=record.cameras.ndc[:1])
-    return cameras, *near_and_far_from(look.c2w[None, :, 3], record)
+    return cameras, *near_and_far_from(state.c2w[None, :, 3], record)

@@ -27,7 +27,7 @@ NEAR, SAME_WAY = 2e-3, 1 - 1e-5
 
 
 class ViewerClient:
-    """Convert movements of viser's camera to looks, and views to what the page shows.
+    """Convert movements of viser's camera to camera states, and views to what the page shows.
 
     viser calls this from its own threads; pictures come from the rendering thread, the finest with a height of
     `most_height` pixels.
@@ -48,7 +48,7 @@ class ViewerClient:
         """Called when the camera may have moved, before the picture."""
         self._drawn_over: set[str] = set()
         self._arrived = False
-        self._seen: tuple[View, CameraState] | None = None
+        self._last_view: tuple[View, CameraState] | None = None
         self.picture: UInt8[Tensor, "height width 3"] | None = None
         """What was last sent."""
         self._wants_present, self._presenting = False, threading.Lock()
@@ -56,11 +56,11 @@ class ViewerClient:
 
     def start(self) -> None:
         """Follow the camera from now on, and show a picture at once."""
-        self.client.camera.on_update(self.queue.errors.harmless(lambda _: self.look()))
-        self.look()
+        self.client.camera.on_update(self.queue.errors.harmless(lambda _: self.request_view()))
+        self.request_view()
         self.queue.add(self.client.client_id, self.refinement)
 
-    def look(self) -> None:
+    def request_view(self) -> None:
         """Request the camera's present view."""
         camera = self.client.camera
         self.on_move()
@@ -99,14 +99,14 @@ class ViewerClient:
         with self.client.atomic():
             self.client.camera.position = c2w[:, 3].double().numpy()
             self.client.camera.look_at = (c2w[:, 3] - ahead * c2w[:, 2]).double().numpy()
-        self.look()
+        self.request_view()
 
     def leave(self) -> None:
         """Look freely again."""
         if self.photograph is not None:
             self.photograph = None
             self.on_leave()
-            self.look()
+            self.request_view()
 
     def present(self) -> None:
         """Send the newest view again, as another channel or with another split of the comparison.
@@ -118,8 +118,8 @@ class ViewerClient:
         while self._wants_present and self._presenting.acquire(blocking=False):
             try:
                 self._wants_present = False
-                if self._seen is not None:
-                    self._send(*self._seen)
+                if self._last_view is not None:
+                    self._send(*self._last_view)
             finally:
                 self._presenting.release()
 
@@ -130,22 +130,22 @@ class ViewerClient:
         if bool(self._drawn_over) != had:
             self.present()
 
-    def _show(self, view: View, look: CameraState, finest: bool) -> None:
-        self._seen = view, look
-        self._send(view, look)
+    def _show(self, view: View, state: CameraState, finest: bool) -> None:
+        self._last_view = view, state
+        self._send(view, state)
         height, width = view.opacity.shape
         self.on_picture(height, width, finest)
         if finest:
             self.on_finest()
 
-    def _send(self, view: View, look: CameraState) -> None:
+    def _send(self, view: View, state: CameraState) -> None:
         picture, depth = picture_of(view, self.channel), None
-        if look.photograph is not None:
+        if state.photograph is not None:
             height, width, _ = picture.shape
-            if self.photographs.has(look.photograph):
-                truth = self.photographs.picture(look.photograph, width, height)
+            if self.photographs.has(state.photograph):
+                truth = self.photographs.picture(state.photograph, width, height)
                 picture = wiped(truth, picture, self.split)
-            picture = in_window(picture, look.width / look.height)
+            picture = in_window(picture, state.width / state.height)
         elif self._drawn_over and self.around.radius < FARTHEST / FARTHER:
             depth = planar_depth(view)
         self.picture = picture

@@ -95,7 +95,7 @@ class Controls:
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
             self.frusta.draw_box(self.session.crop)
-            self.session.look()
+            self.session.request_view()
 
         for each in (on, *sliders):
             each.on_update(self.harmless(update))

@@ -40,7 +40,7 @@ class Frusta:
         """Show or hide the cameras of the photographs."""
         if visible and not self.has_cameras:
             self.has_cameras = True
-            for view in self.session.photographs.shown:
+            for view in self.session.photographs.frustum_views:
                 self._add_camera(view)
         self.cameras.visible = visible
         self.session.draw_over("cameras", visible)

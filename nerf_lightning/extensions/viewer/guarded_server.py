@@ -63,7 +63,7 @@ class Auth:
 
     def __init__(self, host: str, hosts: Sequence[str] | str | None = None):
         self.host, self.token = host, secrets.token_urlsafe(32)
-        self._given = set[str]()
+        self._extra_hosts = set[str]()
         for each in [hosts] if isinstance(hosts, str | int) else hosts or ():
             match = HOST.fullmatch(str(each).lower())
             if match is None:
@@ -71,8 +71,8 @@ class Auth:
                     f"viewer.hosts: {each!r} is not the name of a machine: give names such as castle.example or "
                     "192.168.1.5."
                 )
-            self._given.add(match[1])
-        self._known = {*LOCAL, f"[{host}]" if ":" in host else host.lower(), *self._given}
+            self._extra_hosts.add(match[1])
+        self._allowed_hosts = {*LOCAL, f"[{host}]" if ":" in host else host.lower(), *self._extra_hosts}
 
     def refusal(self, request: "Request") -> tuple[HTTPStatus, str] | None:
         """Return why a request is refused, in one sentence; None: it is admitted."""
@@ -83,10 +83,10 @@ class Auth:
             return HTTPStatus.BAD_REQUEST, "A request must have one Host header."
         host, source = hosts[0].lower(), ", ".join(origins).lower().partition("://")[2]
         name, from_name = (match[1] if (match := HOST.fullmatch(each)) else None for each in (host, source))
-        if name not in self._known:
+        if name not in self._allowed_hosts:
             hint = f": if it is yours, start nerf with viewer.hosts=[{name}]" if name else ""
             return HTTPStatus.FORBIDDEN, f"The page is not served under this name{hint}."
-        if any(origins) and source != host and from_name not in self._given:
+        if any(origins) and source != host and from_name not in self._extra_hosts:
             return HTTPStatus.FORBIDDEN, "This request comes from another site, which may not access this page."
         words = re.split("[?&;=]", ";".join([request.path, *cookies]))
         if any(secrets.compare_digest(word.encode(errors="surrogateescape"), self.token.encode()) for word in words):

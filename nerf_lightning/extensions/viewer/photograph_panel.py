@@ -30,7 +30,7 @@ class PhotographPanel:
         self.choice.on_update(harmless(self._choose))
         self.split.on_update(harmless(self._compare))
         self.leave.on_click(harmless(lambda _: session.leave()))
-        session.on_leave = self._left
+        session.on_leave = self._on_leave
         session.photographs.when_read.append(harmless(self._show_anew))
 
     def enter(self, view: int) -> None:
@@ -61,7 +61,7 @@ class PhotographPanel:
         self.frusta.has_cameras = False
         self.frusta.show(self.frusta.cameras.visible)
 
-    def _left(self) -> None:
+    def _on_leave(self) -> None:
         self.choice.value = NONE
         self.name.visible = self.leave.visible = self.split.visible = False
         self.frusta.hide(False)

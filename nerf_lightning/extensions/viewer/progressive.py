@@ -16,14 +16,14 @@ MOST_SQUARES = 4
 class Job:
     """A picture that is being rendered."""
 
-    look: CameraState
+    state: CameraState
     height: int
     is_coarse: bool
     slices: Generator[None, None, View]
 
 
 class ProgressiveRendering:
-    """Render the requested look, a slice at a time.
+    """Render the requested camera state, a slice at a time.
 
     A finer picture is dropped between two slices if the request has changed. A coarse one is finished and shown: it is
     small, and a user who never stops moving would otherwise see nothing.
@@ -35,18 +35,18 @@ class ProgressiveRendering:
     def __init__(self, show: Callable[[View, CameraState, bool], None], most_height: int = 720):
         self.show, self.most_height = show, most_height
         self.wish: CameraState | None = None
-        self.shown: CameraState | None = None
-        self.shown_height = 0
+        self.displayed: CameraState | None = None
+        self.displayed_height = 0
         self.is_stale = False
         self.served = 0.0
         """Time of its last turn (the queue's clock)."""
         self._job: Job | None = None
         self._tried: CameraState | None = None
-        """The look of the last job."""
+        """The camera state of the last job."""
 
-    def ask(self, look: CameraState) -> None:
-        """Request another look."""
-        self.wish = look
+    def ask(self, state: CameraState) -> None:
+        """Request another camera state."""
+        self.wish = state
 
     def refresh(self) -> None:
         """Render the finest picture again: the model has changed, or a user wants to save it."""
@@ -54,17 +54,17 @@ class ProgressiveRendering:
 
     def give_up(self) -> None:
         """Drop what could not be rendered or shown, and wait for another request, or for another model."""
-        self.shown, self.shown_height = self._tried, self.most_height
+        self.displayed, self.displayed_height = self._tried, self.most_height
         self._job = None
 
     @property
     def is_moving(self) -> bool:
         """Whether nothing has been shown of the current request yet."""
-        return self.wish is not self.shown
+        return self.wish is not self.displayed
 
     def work(self, renderer: SlicedRenderer) -> bool:
         """Render a slice; return False if nothing is left to do."""
-        if self._job is not None and self._job.look is not self.wish and not self._job.is_coarse:
+        if self._job is not None and self._job.state is not self.wish and not self._job.is_coarse:
             self._job.slices.close()
             self._job = None
         if self._job is None:
@@ -75,25 +75,25 @@ class ProgressiveRendering:
             next(self._job.slices)
         except StopIteration as end:
             job, self._job = self._job, None
-            self.shown, self.shown_height = job.look, job.height
-            self.show(end.value, job.look, job.height == self._full_height(job.look))
+            self.displayed, self.displayed_height = job.state, job.height
+            self.show(end.value, job.state, job.height == self._full_height(job.state))
         return True
 
     def _next_job(self, renderer: SlicedRenderer) -> Job | None:
-        look = self._tried = self.wish
-        if look is None:
+        state = self._tried = self.wish
+        if state is None:
             return None
-        full = self._full_height(look)
-        if look is not self.shown:
-            height = min(full, renderer.height_while_moving(look))
-            return Job(look, height, True, renderer.slices(look, height))
-        if self.shown_height >= full and not self.is_stale:
+        full = self._full_height(state)
+        if state is not self.displayed:
+            height = min(full, renderer.height_while_moving(state))
+            return Job(state, height, True, renderer.slices(state, height))
+        if self.displayed_height >= full and not self.is_stale:
             return None
-        height = full if AT_MOST_FINER * self.shown_height >= full else FINER * self.shown_height
+        height = full if AT_MOST_FINER * self.displayed_height >= full else FINER * self.displayed_height
         if height == full:
             self.is_stale = False
-        return Job(look, height, False, renderer.slices(look, height))
+        return Job(state, height, False, renderer.slices(state, height))
 
-    def _full_height(self, look: CameraState) -> int:
-        widest = int(self.most_height * (MOST_SQUARES * look.height / look.width) ** 0.5)
-        return max(1, min(look.height, self.most_height, widest))
+    def _full_height(self, state: CameraState) -> int:
+        widest = int(self.most_height * (MOST_SQUARES * state.height / state.width) ** 0.5)
+        return max(1, min(state.height, self.most_height, widest))

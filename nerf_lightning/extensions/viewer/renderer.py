@@ -38,7 +38,7 @@ class View:
 
 @dataclass(eq=False)
 class SlicedRenderer:
-    """Render looks with a model, and measure the speed.
+    """Render camera states with a model, and measure the speed.
 
     Args:
         model: in evaluation mode while it renders.
@@ -55,23 +55,23 @@ class SlicedRenderer:
     moving_seconds: float = 0.1
     rays_per_second: float | None = None
 
-    def height_while_moving(self, look: CameraState) -> int:
+    def height_while_moving(self, state: CameraState) -> int:
         """Return the height of a picture that allows several per second."""
         rays = (self.rays_per_second or FIRST_RAYS) * self.share * self.moving_seconds
-        return max(LEAST_HEIGHT, int((rays * look.height / look.width) ** 0.5))
+        return max(LEAST_HEIGHT, int((rays * state.height / state.width) ** 0.5))
 
     def warm_up(self) -> None:
         """Render a small picture from the first photograph's position to load kernels and measure the speed."""
-        look = CameraState(self.scene.cameras.c2w[0], 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT)
+        state = CameraState(self.scene.cameras.c2w[0], 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT)
         for _ in range(2):
-            for _ in self.slices(look, WARM_UP_HEIGHT):
+            for _ in self.slices(state, WARM_UP_HEIGHT):
                 pass
 
-    def slices(self, look: CameraState, height: int) -> Generator[None, None, View]:
-        """Render a look at about this height (pixels); yield after each slice, and return the view."""
-        cameras, near, far = camera_of(look, self.scene, height)
+    def slices(self, state: CameraState, height: int) -> Generator[None, None, View]:
+        """Render a camera state at about this height (pixels); yield after each slice, and return the view."""
+        cameras, near, far = camera_of(state, self.scene, height)
         shape = int(cameras.height[0]), int(cameras.width[0])
-        rays_of, clip = RayGenerator(cameras, near, far), None if look.crop is None else Clip(box=look.crop)
+        rays_of, clip = RayGenerator(cameras, near, far), None if state.crop is None else Clip(box=state.crop)
         parts, start, total = [], 0, pixels_in_quads(*shape)
         while start < total:
             stop = start + self._rays_in_a_slice(total - start)
@@ -94,7 +94,7 @@ class SlicedRenderer:
         bent = rays_of.ndc is not None
         return seen.rgb, world_distance(straight.to("cpu"), depth / far) if bent else depth, seen.opacity
 
-    def _rays_in_a_slice(self, left: int) -> int:
+    def _rays_in_a_slice(self, remaining: int) -> int:
         rays = QUAD * max(16, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS / QUAD))
         # No tiny remainder at the end: it would cost as much as a slice.
-        return left if left < 1.5 * rays else rays
+        return remaining if remaining < 1.5 * rays else rays

@@ -36,7 +36,7 @@ class Photographs:
             act()
 
     @property
-    def shown(self) -> list[int]:
+    def frustum_views(self) -> list[int]:
         """The views that get a frustum: all, or evenly chosen ones of very many."""
         count = len(self.record.view_names)
         if count <= MOST_FRUSTA:

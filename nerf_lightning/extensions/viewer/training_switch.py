@@ -77,7 +77,7 @@ class TrainingPanel:
 
     def __init__(self, session: ViewerClient, switch: TrainingSwitch):
         self.session, self.switch = session, switch
-        self._asked = 0.0
+        self._last_press = 0.0
         gui, harmless = session.client.gui, session.queue.errors.harmless
         with gui.add_folder("Training"):
             self.said = gui.add_markdown("")
@@ -97,13 +97,13 @@ class TrainingPanel:
         self.hold.label = GO_ON if switch.wants_pause else PAUSE
         self.hold.visible = switch.can_pause and not switch.wants_stop
         self.end.visible = not switch.wants_stop
-        if time.monotonic() - self._asked > SURE_SECONDS:
+        if time.monotonic() - self._last_press > SURE_SECONDS:
             self.end.label = STOP
         self.said.content = switch.state
 
     def _stop(self) -> None:
         now = time.monotonic()
-        if now - self._asked < SURE_SECONDS:
+        if now - self._last_press < SURE_SECONDS:
             self.switch.stop()
-        self._asked = now
+        self._last_press = now
         self.end.label = SURE

@@ -34,7 +34,7 @@ def garbled(scene):
 
 def test_the_loss_is_the_mean_over_unmasked_pixels():
     train_step, scene = make_step(None), masked(ball_scene(), lambda number: number % 3 > 0)
-    batch = RayBatches(scene, Progress(), 0, 64).at(0, 0)
+    batch = RayBatches(scene, Progress(), 0, 64).batch_at(0, 0)
     kept = batch.weight > 0
     assert 0 < int(kept.sum()) < 64
     seen = train_step.gradients(batch, train_step.key)

@@ -159,7 +159,7 @@ def test_pixels_that_fit_move_once(monkeypatch):
     assert len(moves) == 1
     assert data.batches.prefetch_for is None
     assert data.batches.scene is not scene
-    assert equal(data.batches.at(0, 0), RayDataModule(scene, Progress(), seed=0).batches.at(0, 0))
+    assert equal(data.batches.batch_at(0, 0), RayDataModule(scene, Progress(), seed=0).batches.batch_at(0, 0))
 
 
 def test_a_mapped_store_is_sent_by_name(tmp_path):

@@ -75,7 +75,7 @@ def test_nothing_found_at_first_may_be_found_later(find):
 def test_a_number_of_features_that_is_typed_is_all_that_is_tried(find):
     model, made = find([[model_of(3), model_of(3, first=4)]], num_features=600)
     assert made == 1
-    assert model.apart == ("4.jpg", "5.jpg", "6.jpg")
+    assert model.disconnected == ("4.jpg", "5.jpg", "6.jpg")
 
 
 @pytest.mark.parametrize(("count", "features", "tries"), [(16, 8192, 4), (50, 2048, 4), (300, 2048, 2)])

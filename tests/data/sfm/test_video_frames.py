@@ -35,7 +35,7 @@ def film(tmp_path_factory):
 def test_blurred_frames_are_avoided(film, tmp_path):
     path, frames = film
     seen = []
-    assert write_sharp_frames(path, tmp_path, every=6, seen=seen.append) == 4
+    assert write_sharp_frames(path, tmp_path, every=6, on_frame=seen.append) == 4
     # The last group has frames 18 and 19 alone; 19 is blurred less.
     assert sorted(file.name for file in tmp_path.iterdir()) == [f"frame_{n:06d}.jpg" for n in (3, 9, 15, 19)]
     assert seen == list(range(1, 21))

@@ -37,7 +37,7 @@ def test_as_it_begins_it_changes_no_bit_of_a_step(option, background):
     scene, found = ball_scene(), []
     for name in ("none", option):
         train_step = a_step(name, scene, background, tile_points=200)
-        batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
+        batch = RayBatches(scene, train_step.progress, 0, 64).batch_at(0, 0)
         losses = train_step(batch, train_step.new_optimizer()).losses
         found.append([losses, *(parameter.grad for parameter in train_step.objective.model.parameters())])
     for ours, theirs in zip(*found, strict=True):
@@ -51,7 +51,7 @@ def test_it_learns_from_the_photographs_that_train_and_only_of_them(option):
     train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     optimizer, loader = train_step.new_optimizer(), RayBatches(scene, train_step.progress, 0, 64)
     for _ in range(3):
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     for parameter in train_step.objective.correction.parameters():
         assert float(parameter.detach().abs().max()) > 0
         if len(parameter) == 8:
@@ -90,7 +90,7 @@ def test_the_background_looks_the_same_to_all(option, background):
     with torch.no_grad():
         for parameter in train_step.objective.correction.parameters():
             parameter.uniform_(-1, 1)
-    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 64).at(0, 0), train_step.key)
+    seen = train_step.gradients(RayBatches(scene, train_step.progress, 0, 64).batch_at(0, 0), train_step.key)
     torch.testing.assert_close(seen.rgb, seen.target)
     behind = seen.target
     assert background == "random" or torch.equal(behind, torch.full_like(behind, float(background == "white")))
@@ -102,7 +102,7 @@ def test_pictures_and_validation_show_the_neutral_colours(option):
 
     scene = ball_scene()
     train_step, errors = a_step(option, scene), []
-    batch = RayBatches(scene, train_step.progress, 0, 64).at(0, 0)
+    batch = RayBatches(scene, train_step.progress, 0, 64).batch_at(0, 0)
     pictures = []
     for spread in (0.0, 2.0):
         with torch.no_grad():

@@ -70,7 +70,7 @@ def test_every_hidden_layer_of_the_article_has_it_and_no_head():
 def gradients_of(model, tile_points):
     step = make_step(tile_points, copy.deepcopy(model))
     step.new_optimizer().zero_grad()
-    step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), step.key)
+    step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).batch_at(0, 0), step.key)
     return [parameter.grad for parameter in step.objective.model.parameters()]
 
 

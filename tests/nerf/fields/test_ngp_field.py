@@ -116,7 +116,7 @@ def test_codes_learn_from_their_own_photographs_and_pictures_have_their_mean(mod
     scene, train_step = ball_scene(num_views=8), a_step(a_model(model))
     optimizer, loader = train_step.new_optimizer(), RayBatches(scene, train_step.progress, 0, 64)
     for _ in range(3):
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     field, trained = train_step.objective.model.last.field, list(scene.splits["train"])
     codes = field.codes.detach()
     others = [view for view in range(8) if view not in trained]
@@ -133,7 +133,9 @@ def test_codes_learn_from_their_own_photographs_and_pictures_have_their_mean(mod
 
 def test_a_new_model_takes_the_codes_of_a_checkpoint():
     train_step = a_step(a_model())
-    train_step(RayBatches(ball_scene(num_views=8), train_step.progress, 0, 64).at(0, 0), train_step.new_optimizer())
+    train_step(
+        RayBatches(ball_scene(num_views=8), train_step.progress, 0, 64).batch_at(0, 0), train_step.new_optimizer()
+    )
     again = build(composed("train", "model=fast_small", *SMALL, "field.appearance=4").model)
     model, rays = train_step.objective.model, train_step.objective.rays
     again.load_state_dict(model.state_dict())

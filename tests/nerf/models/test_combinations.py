@@ -82,7 +82,7 @@ def test_it_learns(model, field, position, direction):
     loader = RayBatches(scene, progress, 0, 64)
     losses = []
     for _ in range(30):
-        losses.append(float(train_step(loader.at(0, progress.rays_seen), optimizer).losses[-1]))
+        losses.append(float(train_step(loader.batch_at(0, progress.rays_seen), optimizer).losses[-1]))
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
     assert train_step.guard.skipped == 0
 
@@ -103,7 +103,7 @@ def test_every_kind_of_level_learns_colors_and_known_depths(model):
     train_step = a_step(levels, scene, progress, WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}))
     loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), train_step.new_optimizer(), []
     for _ in range(40):
-        seen = train_step(loader.at(0, progress.rays_seen), optimizer)
+        seen = train_step(loader.batch_at(0, progress.rays_seen), optimizer)
         depth = float(seen.terms["depth"][-1])
         lost.append((float(seen.losses[-1]) - depth, depth))
     photo, depth = (sum(each[-5:]) / sum(each[:5]) for each in zip(*lost, strict=True))
@@ -129,7 +129,7 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     sizes = []
     for _ in range(40):
         sizes.append(progress.batch_rays)
-        train_step(loader.at(0, progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, progress.rays_seen), optimizer)
     assert set(sizes) <= set(batch_sizes(512))
     changes = [place for place in range(1, 40) if sizes[place] != sizes[place - 1]]
     assert changes

@@ -49,7 +49,7 @@ def trained(name, scene):
     set_precision(model, "bfloat16")
     batches, optimizer = RayBatches(scene, progress, 0, rays), train_step.new_optimizer()
     for _ in range(steps):
-        train_step(batches.at(0, progress.rays_seen), optimizer)
+        train_step(batches.batch_at(0, progress.rays_seen), optimizer)
     return model.eval()
 
 

@@ -50,7 +50,7 @@ def test_cameras_can_learn_in_tiles_and_whole():
         train_step.objective.rays = LearntShifts(scene.cameras, scene.near, scene.far)
         train_step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
         optimizer = train_step.new_optimizer()
-        train_step(RayBatches(scene, train_step.progress, 0, 64).at(0, 0), optimizer)
+        train_step(RayBatches(scene, train_step.progress, 0, 64).batch_at(0, 0), optimizer)
         shifts.append(train_step.objective.rays.shift.detach())
     assert float(shifts[0][list(scene.splits["train"])].abs().min()) > 0
     torch.testing.assert_close(shifts[0], shifts[1], rtol=1e-3, atol=1e-7)
@@ -66,7 +66,7 @@ def test_a_training_step_says_which_photograph_it_explains_and_validation_does_n
 
     model.forward = forward
     train_step = make_step(None, model)
-    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).at(0, 0)
+    batch = RayBatches(ball_scene(), train_step.progress, 0, 64).batch_at(0, 0)
     train_step(batch, train_step.new_optimizer())
     assert torch.equal(seen[0], batch.pixels.view)
     RayErrors().of(train_step.objective, batch, None)

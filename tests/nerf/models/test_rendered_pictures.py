@@ -159,7 +159,7 @@ def test_a_picture_is_the_mean_of_one_that_many_times_as_large(side):
 def test_rays_share_a_pixel_and_its_area():
     scene = ball_scene()
     subpixels = Subpixels(2)
-    rays, pixels = rays_of(scene), RayBatches(scene, make_step(None).progress, 0, 5).at(0, 0).pixels
+    rays, pixels = rays_of(scene), RayBatches(scene, make_step(None).progress, 0, 5).batch_at(0, 0).pixels
     centre = rays(pixels)
     subpixels.on_step(StepContext(1.0, 0, 0))
     several = rays.of_pixels(pixels, subpixels)
@@ -176,7 +176,7 @@ def test_a_step_compares_the_mean_of_a_pixel_s_rays_with_its_photograph(tile_poi
     model = model_with(2)
     train_step = make_step(tile_points, model, background)
     found, losses = gradients(train_step, scene)
-    batch, random = RayBatches(scene, make_step(None).progress, 0, 64).at(0, 0), batch_random(fold(0, 0, 0), 64)
+    batch, random = RayBatches(scene, make_step(None).progress, 0, 64).batch_at(0, 0), batch_random(fold(0, 0, 0), 64)
     behind = random.uniform("background", 3) if background == "random" else torch.ones(64, 3)
     renderings = model(
         train_step.objective.rays.of_pixels(batch.pixels, model.subpixels),
@@ -224,7 +224,7 @@ def test_one_ray_a_pixel_leaves_no_trace():
     model = model_with(1)
     model.subpixels.on_step(StepContext(1.0, 0, 0))
     assert not [name for name in model.state_dict() if "subpixels" in name]
-    pixels = RayBatches(ball_scene(), make_step(None).progress, 0, 4).at(0, 0).pixels
+    pixels = RayBatches(ball_scene(), make_step(None).progress, 0, 4).batch_at(0, 0).pixels
     rendering = model(rays_of(ball_scene())(pixels), None, None)[-1]
     assert mean_over_pixels(rendering, 1) is rendering
 

@@ -36,13 +36,13 @@ def operations_of_steps(name, steps, model=None):
     loader = RayBatches(scene, progress, 0, 64)
     # What is read once in a run (switches, the grid's content) is read on the host.
     begin_step(train_step.objective.model, StepContext(0.0, 4, 0))
-    train_step.objective.model(train_step.objective.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)
+    train_step.objective.model(train_step.objective.rays(loader.batch_at(0, 0).pixels), torch.zeros(64, 3), None)
     train_step.objective.to("meta")
     optimizer = train_step.new_optimizer()
     lists = []
     for progress.step in steps:
         with Operations() as operations:
-            train_step(loader.at(0, progress.rays_seen).to("meta"), optimizer)
+            train_step(loader.batch_at(0, progress.rays_seen).to("meta"), optimizer)
         lists.append(operations.seen)
     return lists
 

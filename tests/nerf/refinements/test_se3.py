@@ -49,7 +49,7 @@ def learnt(scene, refinement, model, steps, decay=1.0):
     train_step.schedule, train_step.num_steps = ExponentialDecay(decay_rate=decay), steps
     loader, optimizer = RayBatches(scene, train_step.progress, 0, 768), train_step.new_optimizer()
     for _ in range(steps):
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     return train_step.objective.rays.cameras.map(torch.Tensor.detach)
 
 
@@ -71,7 +71,7 @@ def test_only_photographs_that_are_trained_on_move():
     train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loader, optimizer = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer()
     for _ in range(3):
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
     moved = (train_step.objective.rays.cameras.c2w.detach() - scene.cameras.c2w).abs().amax(dim=(1, 2))
     assert float(moved[:3].min()) > 1e-3
     assert float(moved[3:].max()) == 0.0
@@ -83,7 +83,7 @@ def test_cameras_are_held_until_there_is_a_scene():
     train_step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loader, optimizer, moved = RayBatches(scene, train_step.progress, 0, 64), train_step.new_optimizer(), []
     for _ in range(3):
-        train_step(loader.at(0, train_step.progress.rays_seen), optimizer)
+        train_step(loader.batch_at(0, train_step.progress.rays_seen), optimizer)
         moved.append(float(train_step.objective.rays.refinement.shift.detach().abs().max()))
     assert moved[:2] == [0.0, 0.0]
     assert moved[2] > 1e-3

@@ -60,7 +60,7 @@ def test_the_psnr_is_that_of_the_colours_whatever_the_loss_is(model, loss):
     draw_weights(train_step)
     if loss == "robust":
         train_step.objective.loss.threshold.fill_(0.01)  # at first it leaves nothing out
-    batch = RayBatches(scene, progress, 0, 128).at(0, 0)
+    batch = RayBatches(scene, progress, 0, 128).batch_at(0, 0)
     seen = train_step.gradients(batch, train_step.key)
     error = (seen.rgb - seen.target).square().mean()
     torch.testing.assert_close(psnr(seen.color_errors[-1]), psnr(error))
@@ -74,7 +74,7 @@ def a_system(name):
     progress, scene = Progress(), ball_scene(num_views=6)
     model = fast_model(RaggedLevel) if name == "fast_dense" else tiny_model()
     system = static_system(name, scene, progress, 10, model=model)
-    return system.train_step, RayBatches(scene, progress, 0, 64).at(0, 0)
+    return system.train_step, RayBatches(scene, progress, 0, 64).batch_at(0, 0)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])

@@ -44,7 +44,7 @@ Rows = dict[str, Float[np.ndarray, "rounds"]]
 
 def run(config: DictConfig) -> float:
     """Measure, print a table and write bench.json; return training rays per second."""
-    config, scene = _settled(config)
+    config, scene = _config_and_scene(config)
     bench = prepare(config, scene)
     for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
         bench.take_step()
@@ -75,7 +75,7 @@ def run(config: DictConfig) -> float:
     return float(result["training rays/s"]["median"])
 
 
-def _settled(config: DictConfig) -> tuple[DictConfig, Scene]:
+def _config_and_scene(config: DictConfig) -> tuple[DictConfig, Scene]:
     """Return the config with the choices for its scene, and the scene."""
     on_gpu = build(config.trainer).device_type == "cuda"
     asked, scene = read_scene(composed("bench", config), on_gpu)
@@ -103,7 +103,7 @@ def _rows_of_steps(bench: Bench, config: DictConfig) -> tuple[Rows, float]:
         "matrix": multiplication(bench.settings),
         "train": partial(bench.train, steps),
         "train_plain": partial(bench.train_plainly, steps),
-        "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
+        "load": lambda: bench.batches.batch_at(0, bench.batches.crop_rays(0)),
         "loaded": loaded_steps,
         "render": partial(bench.render, render_rays),
         "render_plain": partial(bench.render, render_rays, plain=True),

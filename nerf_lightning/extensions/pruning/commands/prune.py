@@ -24,7 +24,7 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 
-KEPT = ("format", "choices", "scene", "refined", "precision", "tile_points")
+RECORD_KEYS = ("format", "choices", "scene", "refined", "precision", "tile_points")
 """The parts of a checkpoint's record that do not depend on widths or on a running training."""
 SETTINGS = {each.name: each.type for each in fields(Pruning)} | {
     "keep": float,
@@ -91,7 +91,7 @@ def _content(narrow: Checkpoint, quantized: dict[str, Any]) -> dict[str, Any]:
     """Return the file's content; training cannot resume from it, since an optimizer's state has the wider shapes."""
     elsewhere = {name for part in quantized.values() for name in part}
     state = {f"model.{name}": tensor for name, tensor in narrow.weights.items()}
-    record = {key: narrow.record[key] for key in KEPT if key in narrow.record}
+    record = {key: narrow.record[key] for key in RECORD_KEYS if key in narrow.record}
     record |= {"version": __version__, "config": narrow.config} | ({"quantized": quantized} if elsewhere else {})
     kept = {name: tensor for name, tensor in state.items() if name not in elsewhere}
     return {"state_dict": kept, "global_step": narrow.step, KEY: record}

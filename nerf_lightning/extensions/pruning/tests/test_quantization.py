@@ -44,7 +44,7 @@ def test_float32_comes_back_to_the_bit_float16_to_eleven_and_int8_to_half_a_step
 
 def test_rows_that_are_left_out_come_back_as_their_levels_mean():
     rows, kept = table(), torch.arange(150) % 3 == 0
-    back, packed = round_trip(rows, "float32", STARTS, kept=kept)
+    back, packed = round_trip(rows, "float32", STARTS, mask=kept)
     assert packed["values"].shape == (50, 4)
     assert torch.equal(back[kept], rows[kept])
     mean = rows[:40][~kept[:40]].mean(dim=0)

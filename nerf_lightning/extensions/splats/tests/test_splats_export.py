@@ -141,9 +141,9 @@ def test_a_photograph_through_a_lens_is_what_a_pinhole_sees():
     for view in (0, 3):
         seen = photographed(bent, view, without_lens(bent.cameras, 800))
         expected = photographed(straight, view, without_lens(straight.cameras, 800))
-        error = (seen.over(torch.zeros(3)) - expected.over(torch.zeros(3))).abs()[seen.kept]
+        error = (seen.over(torch.zeros(3)) - expected.over(torch.zeros(3))).abs()[seen.mask]
         assert float(error.mean()) < 0.01
-        assert 0.5 < float(seen.kept.float().mean()) < 1.0 or bool(seen.kept.all())
+        assert 0.5 < float(seen.mask.float().mean()) < 1.0 or bool(seen.mask.all())
 
 
 def test_larger_photographs_are_shrunk_with_their_cameras():

@@ -85,7 +85,7 @@ def test_the_nearest_of_the_same_capture_are_sources_and_never_the_view_itself(k
     random = None if key is None else batch_random(key, len(rays.near))
     sources = choose_sources(photographs_of(scene, range(12)), rays, 2, random)
     for ray, target in enumerate(sources.target.tolist()):
-        places, view = sources.views[target][sources.given[target]].tolist(), int(rays.photograph[ray])
+        places, view = sources.views[target][sources.valid[target]].tolist(), int(rays.photograph[ray])
         assert view not in places
         assert all(place % 2 == view % 2 for place in places)
         assert key is not None or set(places) == {view - 2, (view + 2) % 12}

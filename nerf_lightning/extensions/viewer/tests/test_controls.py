@@ -78,7 +78,7 @@ def test_the_last_movement_wins_over_one_that_is_still_being_read(tmp_path):
         return old
 
     session.pose, session.on_move = slow, lambda: None
-    threads = [threading.Thread(target=session.look) for _ in range(2)]
+    threads = [threading.Thread(target=session.request_view) for _ in range(2)]
     threads[0].start()
     assert read.wait(20)
     panel.client.camera.position = np.array([1.0, 2.0, 3.0])

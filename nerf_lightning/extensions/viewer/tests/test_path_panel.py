@@ -76,7 +76,7 @@ def test_whoever_adds_a_keyframe_does_not_stand_in_its_lines(tmp_path):
     camera = panel.client.scene.add_camera_frustum.return_value
     assert camera.visible is False
     panel.client.camera.position = panel.client.camera.position + np.array([0.0, 0.0, 1.0])
-    panel.session.look()
+    panel.session.request_view()
     assert camera.visible is True
 
 
