@@ -267,7 +267,8 @@ def test_the_site_is_built_without_a_warning(site):
 
 FORMULAS = """
 const boxes = [...document.querySelectorAll("div.math")], faults = boxes.length ? [] : ["there are no formulas"];
-if (document.documentElement.scrollWidth > innerWidth) faults.push("the page scrolls sideways");
+const {scrollWidth, clientWidth} = document.documentElement;
+if (scrollWidth > clientWidth) faults.push("the page scrolls sideways");
 const wide = box => box.scrollWidth > box.clientWidth && box.children.length > 1;
 const cut = box => box.scrollHeight > box.clientHeight;
 return [...faults, ...boxes.filter(box => wide(box) || cut(box)).map(box => box.textContent)];

@@ -160,7 +160,7 @@ def baked_background(analysis: Analysis) -> Check:
         return ok(message)
     even = looks.border_even > EVEN
     if scene.pixels.has_transparency or float(even.float().mean()) < 0.8:
-        return ok(f"{scene.background}, behind what the photographs show")
+        return ok(f"{at_evaluation(scene.background)} where a ray meets nothing (scene.background)")
     colour = looks.border[even].median(dim=0).values
     usual = [known for known, level in COLOURS.items() if float((colour - level).abs().max()) < 0.03]
     words = usual[0] if usual else "of the color " + ", ".join(f"{255 * float(level):.0f}" for level in colour)

@@ -122,6 +122,7 @@ class Scoring:
             "split_views": len(scene.splits[self.split]),
             "pictures": [scene.view_names[view] for view in shown_views],
             "worst_views": worst,
+            "depth_scale": dict(zip(("near", "far"), depth_range, strict=True)) | {"unit": told_length(scene)[1]},
             "protocol": measured_how(scene, self.split, views, background, self.quantize, self.lpips, self.colors),
             "origin": origin or {},
             "environment": environment(),

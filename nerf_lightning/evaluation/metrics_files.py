@@ -16,6 +16,8 @@ from nerf_lightning.messages.escaping import for_csv
 
 METRICS = ("psnr", "cc_psnr", "ssim", "lpips", "depth_error", "normal_error")
 COLUMNS = ("name", *METRICS, "seconds")
+PLAINER = {"mean of the pictures' own": "mean over the pictures"}
+"""Values that results are compared by, and that stay as they are in files, in plainer words."""
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -72,5 +74,5 @@ def as_text(value: Any) -> str:
     ('800 x 800, 400 x 300', 'white')
     """
     if not isinstance(value, list):
-        return str(value)
+        return PLAINER.get(value, str(value)) if isinstance(value, str) else str(value)
     return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)

@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
 from nerf_lightning.evaluation.metrics_files import COLUMNS, as_text
 from nerf_lightning.files.json_files import mapping, number
 from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.page import Pairs, ViewOnPage, embedded_file
+from nerf_lightning.report.page import Pairs, ViewOnPage, embedded
 
 FORMATS = {
     "psnr": "{:.2f} dB",
@@ -20,10 +21,9 @@ FORMATS = {
     "normal_error": "{:.1f}°",
     "seconds": "{:.3f}",
 }
+NAMES = {"psnr": "PSNR", "cc_psnr": "PSNR with fitted colors", "ssim": "SSIM", "lpips": "LPIPS"}
 LABELS = {
-    "cc_psnr": "PSNR with fitted colors",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
+    **{metric: name for metric, name in NAMES.items() if metric != "psnr"},
     "depth_error": "mean depth error (scene units)",
     "normal_error": "mean error of surface normals",
 }
@@ -49,7 +49,7 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     trained = number(note.get("training_seconds"))
     shown.append(("training", "" if trained is None else spoken(trained)))
     for label, value, form in (
-        ("frames per second", metrics.get("frames_per_second"), "{:.3g}"),
+        ("rendering by the model", metrics.get("frames_per_second"), "{:.3g} frames per second"),
         ("peak memory", metrics.get("peak_memory_gigabytes"), "{:.2f} GB"),
         ("steps", note.get("finished_at_step"), "{:,.0f}"),
         ("parameters", origin.get("parameters"), "{:,.0f}"),
@@ -65,16 +65,16 @@ def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     rows = [row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)][:MOST_ROWS]
     columns = [column for column in COLUMNS if any(row.get(column) is not None for row in rows)]
     texts = [[str(row.get(c, ""))[:200] if c == "name" else _formatted(c, row.get(c)) for c in columns] for row in rows]
-    return [column.replace("_", " ") for column in columns], texts
+    return [_name(column) for column in columns], texts
 
 
 def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     """Return protocol, origin and environment as pairs of texts."""
     titles = {"protocol": "Protocol", "origin": "Provenance", "environment": "Environment"}
     told = {key: list(mapping(metrics.get(key)).items())[:MOST_PAIRS] for key in titles}
-    pairs = {key: [(name.replace("_", " ")[:80], _said(value)) for name, value in found] for key, found in told.items()}
+    pairs = {key: [(_name(name)[:80], _said(value)) for name, value in found] for key, found in told.items()}
     if pairs["protocol"] and metrics.get("lpips") is None:
-        pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "lpips"), ("LPIPS", WITHOUT_LPIPS)]
+        pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "LPIPS"), ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]
 
 
@@ -102,7 +102,10 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
 
 def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
     files = {part: folder / f"{part}.png" for part in PARTS}
-    parts = {part: embedded_file(file) for part, file in files.items() if part != "true_depth" or file.is_file()}
+    pixels = {part: read_rgba(file)[..., :3] for part, file in files.items() if part != "true_depth" or file.is_file()}
+    # The scales beside depth and error have letters too small for a page, which says what they say.
+    width = pixels["truth"].shape[1]
+    parts = {part: embedded(picture[:, :width]) for part, picture in pixels.items()}
     known = {metric: _formatted(metric, row.get(metric)) for metric in ("psnr", "ssim")}
     numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)
@@ -113,7 +116,22 @@ def _formatted(metric: str, value: Any) -> str:
     return "" if known is None else FORMATS[metric].format(known)
 
 
+def depth_scale(metrics: dict[str, Any]) -> str:
+    """Return what is known about the colors of depth."""
+    scale = mapping(metrics.get("depth_scale"))
+    near, far = number(scale.get("near")), number(scale.get("far"))
+    if near is None or far is None:
+        return ""
+    return f"bright: {near:.3g}, dark: {far:.3g} {str(scale.get('unit', ''))[:40]}"
+
+
+def _name(key: str) -> str:
+    return NAMES.get(key, key.replace("_", " "))
+
+
 def _said(value: Any) -> str:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return f"{value:,}"
     return "none" if value is None else as_text(value)[:300]
 
 

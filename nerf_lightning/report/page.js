@@ -36,7 +36,9 @@ if (depth) {
 }
 
 // Charts: each curve, smoothed where it is noisy, and the values at the pointer.
-const COLORS = ["#2f6db3", "#e07b39", "#3c9d6b", "#8b5fbf", "#c8372d", "#6a7280"];
+const COLORS = [
+  "#2f6db3", "#c2560a", "#1f7f4f", "#8b4fbf", "#c3203f", "#5d6673", "#0a7c8c", "#7a4a1e", "#d01fa8", "#6c7200", "#1b1f8a", "#000000",
+];
 const HEIGHT = 260, LEFT = 56, RIGHT = 10, TOP = 8, BOTTOM = 34, SMOOTHING = 0.9;
 
 function put(parent, name, attributes, text = "") {
@@ -76,12 +78,16 @@ function logarithmic(low, high) {
   return found.filter((_, number) => number % Math.ceil(found.length / 6) === 0);
 }
 
-const short = value => {
-  const size = Math.abs(value);
-  if (size >= 1e6) return +(value / 1e6).toPrecision(3) + "M";
-  if (size >= 1e4) return +(value / 1e3).toPrecision(3) + "k";
-  return size !== 0 && size < 1e-3 ? value.toExponential(0) : String(+value.toPrecision(3));
-};
+// The labels of an axis, all in one notation.
+function short(values) {
+  const sizes = values.map(Math.abs).filter(size => size > 0), most = Math.max(...sizes);
+  const tiny = Math.min(...sizes) < 1e-3;
+  const [unit, letter] = tiny || most < 1e4 ? [1, ""] : most < 1e6 ? [1e3, "k"] : [1e6, "M"];
+  return values.map(value => {
+    const rounded = +(value / unit).toPrecision(3);
+    return rounded === 0 ? "0" : tiny ? rounded.toExponential() : rounded + letter;
+  });
+}
 
 function draw(figure, chart) {
   const place = figure.querySelector("div"), label = figure.querySelector("output");
@@ -104,12 +110,14 @@ function draw(figure, chart) {
 
   place.replaceChildren();
   const svg = put(place, "svg", {width, height: HEIGHT, role: "img", "aria-label": chart.label});
-  for (const value of chart.is_logarithmic ? logarithmic(low, high) : ticks(low, high, 5)) {
+  const heights = chart.is_logarithmic ? logarithmic(low, high) : ticks(low, high, 5), levels = short(heights.map(back));
+  heights.forEach((value, k) => {
     put(svg, "line", {class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value)});
-    put(svg, "text", {x: LEFT - 6, y: y(value) + 4, "text-anchor": "end"}, short(back(value)));
-  }
-  for (const step of ticks(first, last, Math.max(2, width / 110)))
-    put(svg, "text", {x: x(step), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle"}, short(step));
+    put(svg, "text", {x: LEFT - 6, y: y(value) + 4, "text-anchor": "end"}, levels[k]);
+  });
+  const marked = ticks(first, last, Math.max(2, width / 110)), steps = short(marked);
+  marked.forEach((step, k) =>
+    put(svg, "text", {x: x(step), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle"}, steps[k]));
   put(svg, "text", {x: width - RIGHT, y: HEIGHT - 3, "text-anchor": "end"}, "step");
   curves.forEach((curve, number) => {
     const points = line => line.map((value, k) => `${x(curve.steps[k]).toFixed(1)},${y(value).toFixed(1)}`).join(" ");

@@ -18,6 +18,7 @@ from nerf_lightning.files.html import data_address, json_in_page, write_page
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import Drawing
+from nerf_lightning.visualization.pictures import ERROR_SCALE
 
 LONGEST_SIDE = 1600
 LOSSLESS_PIXELS = 1 << 18
@@ -101,6 +102,8 @@ class Report:
     """Further numbers, folded."""
     missing: list[str] = field(default_factory=list)
     """What could not be shown, and why."""
+    depth_scale: str = ""
+    """What the brightest and the darkest color of depth stand for; empty: unknown."""
     worst: list[ViewOnPage] = field(default_factory=list)
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
@@ -123,4 +126,5 @@ class Report:
 def write_report(report: Report, target: Path) -> None:
     """Write the report as one file of HTML."""
     charts = [chart._asdict() for chart in report.curves]
-    write_page(FOLDER / "page.html", target, report=report, charts=json_in_page(charts))
+    error_scale = f"{100 * ERROR_SCALE:g} %"
+    write_page(FOLDER / "page.html", target, report=report, charts=json_in_page(charts), error_scale=error_scale)

@@ -15,7 +15,7 @@ from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings, read_curves
-from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page
+from nerf_lightning.report.metrics import depth_scale, facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import Report, embedded, embedded_file, embedded_video
 from nerf_lightning.runs.results import scene_name
 from nerf_lightning.runs.summary import read_note
@@ -128,6 +128,7 @@ def _add_measured(report: Report, run: Path, file: Path) -> None:
     report.columns, report.per_image = per_image(metrics)
     report.split = str(mapping(metrics.get("protocol")).get("split", "test"))[:20]
     report.tables = tables(metrics)
+    report.depth_scale = depth_scale(metrics)
     if not metrics:
         report.missing.append(f"Numbers: there is no {file.relative_to(run)} that can be read.")
     report.worst, report.views, missing = views_on_page(metrics, file.parent / "images")
@@ -161,6 +162,7 @@ def _add_coverage(report: Report, run: Path) -> None:
     held = {split: record.splits.get(split, ()) for split in SPLITS}
     if held["val"] == held["test"]:
         del held["val"]
-    views = ", ".join(f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers)
+    *most, last = [f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers]
+    views = f"{', '.join(most)} and {last}" if most else last
     report.subtitle = f"model {checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
     report.coverage = embedded(coverage_picture(record).numpy())

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
-from nerf_lightning.report.metrics import WITHOUT_LPIPS, facts, tables, views_on_page
+from nerf_lightning.report.metrics import WITHOUT_LPIPS, depth_scale, facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
 
 
@@ -77,3 +77,15 @@ def test_the_page_says_how_many_views_were_measured_and_what_lpips_needs_where_i
     assert ("views measured", "10 of 25") in facts(counts, {})
     assert ("views measured", "25") in facts(counts | {"num_images": 25}, {})
     assert "views measured" not in dict(facts({}, {}))
+
+
+def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():
+    origin = {"parameters": 12525764, "megabytes": 50.1, "seed": 0, "tied": False}
+    found = tables({"origin": origin, "protocol": {"psnr": "mean of the pictures' own"}})
+    assert [text for _, text in dict(found)["Provenance"]] == ["12,525,764", "50.1", "0", "False"]
+    assert ("PSNR", "mean over the pictures") in dict(found)["Protocol"]
+    columns, rows = per_image({"per_image": [{"name": "a", "psnr": 28.5, "cc_psnr": 29}]})
+    assert (columns, rows) == (["name", "PSNR", "PSNR with fitted colors"], [["a", "28.50 dB", "29.00 dB"]])
+    scale = {"near": 2.4444, "far": 9.6, "unit": "meters"}
+    assert depth_scale({"depth_scale": scale}) == "bright: 2.44, dark: 9.6 meters"
+    assert depth_scale({"depth_scale": {"near": "x"}}) == depth_scale({}) == ""

@@ -121,8 +121,9 @@ def unfold(driver, title: str, inside: str, seconds: float = 60.0) -> None:
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 LAYOUT = """
 const seen = element => { const box = element.getBoundingClientRect(); return box.width > 0 && box.height > 0; };
-const faults = [], wide = document.documentElement.scrollWidth;
-if (wide > innerWidth) faults.push(`it is ${wide} pixels wide, in a window of ${innerWidth}`);
+// A phone widens innerWidth to what does not fit, and shows all of it smaller.
+const faults = [], {scrollWidth, clientWidth} = document.documentElement;
+if (scrollWidth > clientWidth) faults.push(`it is ${scrollWidth} pixels wide, in a window of ${clientWidth}`);
 for (const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT); walker.nextNode();) {
   const element = walker.currentNode.parentElement, text = walker.currentNode.textContent.trim();
   if (!text || !seen(element) || element.closest("script, style, option")) continue;

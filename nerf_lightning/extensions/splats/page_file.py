@@ -102,7 +102,7 @@ def write_page(
     }
     page = {
         "title": title or run.name or record.name,
-        "facts": [("scene", record.name), *run.facts, *facts],
+        "facts": [("This page", facts), ("Model (test views)" if record.splits.get("test") else "Model", run.facts)],
         "views": [_view(record, run, view if max_photographs else None) for view in views],
         "still": _jpeg(_still(shown, record, first), STILL),
         "background": BACKGROUND_COLORS[at_evaluation(record.background)],

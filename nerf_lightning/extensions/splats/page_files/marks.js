@@ -1,6 +1,7 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
 const MIDDLE = matchMedia("(pointer: coarse)").matches ? "" : ", or press Enter for the middle";
+const NARROW = matchMedia("(max-width: 600px)"), TOLD = 6000;  // milliseconds that a result stays
 const ASKS = {
   note: `Tap the place that the note is about${MIDDLE}.`,
   distance: `Tap the first point${MIDDLE}.`,
@@ -19,6 +20,7 @@ class Marks {
     on("add-note", () => this.begin("note"));
     on("measure", () => this.begin("distance"));
     on("remove-mark", () => this.remove());
+    for (const name of ["pointerdown", "wheel", "keydown"]) addEventListener(name, () => this.forget(), { capture: true, passive: true });
     on("save-marks", () => save("views.json", new Blob([JSON.stringify(this.lists, null, 1)], { type: "application/json" })));
     this.changed();
   }
@@ -40,6 +42,7 @@ class Marks {
     this.asks = asks;
     byId("told").textContent = ASKS[asks] ?? "";
     document.body.classList.toggle("asking", asks !== null);
+    if (asks !== null && NARROW.matches) byId("tools").open = false;  // the drawer lies over what is to be tapped
     byId("scene").focus();  // where Enter stands for the middle
   }
 
@@ -65,8 +68,13 @@ class Marks {
       this.begin(null);
       this.add("distances", { from: this.first, to: point });
       byId("told").textContent = this.told(this.lists.distances.at(-1));
+      clearTimeout(this.passing);
+      this.passing = setTimeout(() => this.forget(), TOLD);
     }
   }
+
+  // A result stays until the next action; what is asked for, until it is done.
+  forget() { if (this.asks === null) byId("told").textContent = ""; }
 
   add(kind, mark) {
     this.lists[kind].push(mark);

@@ -214,8 +214,10 @@ function fly(frames, seconds) {
 
 // The photograph lies over what its camera shows.
 function place(view) {
-  const photograph = byId("photograph"), source = sourceOf(view.photograph);
+  const photograph = byId("photograph"), seam = byId("seam"), source = sourceOf(view.photograph);
+  const share = Number(byId("wipe").value) / 100;
   photograph.hidden = byId("wiping").hidden = !source;
+  seam.hidden = !source || share === 0 || share === 1;
   for (const button of document.querySelectorAll("#photographs button")) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
@@ -223,7 +225,8 @@ function place(view) {
   const { lens } = view, { scale, center } = lensIn(view), [left, top] = plus(center, lens.center, -scale);
   const box = { width: scale * lens.width, height: scale * lens.height, left, top };
   for (const [name, pixels] of Object.entries(box)) photograph.style[name] = `${pixels}px`;
-  photograph.style.setProperty("--at", `${byId("wipe").value}%`);
+  photograph.style.setProperty("--at", `${100 * share}%`);
+  for (const [name, pixels] of Object.entries({ left: left + share * box.width, top, height: box.height })) seam.style[name] = `${pixels}px`;
   if (photograph.src !== source) photograph.src = source;
 }
 

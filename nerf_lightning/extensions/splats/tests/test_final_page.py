@@ -193,7 +193,7 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, finishe
     if result.code:  # 20 steps may leave a field without anything in it
         said(result, "There is no surface to put splats on")
         return
-    assert "dB on 1 test view, the field" in result.out
+    assert "dB on 1 test view; the model, compared in the same way" in result.out
     assert f"{tmp_path}/page.html" in result.out
     text = (tmp_path / "page.html").read_text()
     psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]

@@ -63,7 +63,12 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
         run(TAP, width / 2, height / 2)
         run(TAP, width / 2, height / 2 + 30)
         told = run("return document.querySelector('#pins .distance').textContent")
+        assert run("return document.getElementById('told').textContent") == told
         press(driver, "delete")
+        assert run("return document.getElementById('told').textContent") == ""
+        run("document.getElementById('tools').open = true; document.getElementById('measure').click()")
+        assert not run("return document.getElementById('tools').open")  # a narrow window, which it would cover
+        press(driver, "escape")
         press(driver, "m")
         press(driver, "enter")
         press(driver, "escape")
