@@ -1,5 +1,7 @@
 """Photographs are chosen by their names, looked through, and left."""
 
+from unittest.mock import MagicMock
+
 from support.scenes import ball_scene
 from support.viewer_panel import Panel
 
@@ -61,6 +63,7 @@ def test_names_that_are_shortened_alike_get_a_number(tmp_path):
 
 def test_cameras_around_the_viewer_are_hidden(tmp_path):
     panel = Panel(tmp_path)
+    cameras = [MagicMock(visible=True) for _ in range(4)]
+    panel.client.scene.add_camera_frustum.side_effect = cameras
     panel.set("Show cameras", True)
-    shown = [camera.visible is not False for camera, _ in panel.controls.frusta._photographed]
-    assert shown == [False, True, True, True]
+    assert [camera.visible for camera in cameras] == [False, True, True, True]
