@@ -22,6 +22,7 @@ html_show_copyright = False
 html_extra_path = ["llms.txt"]
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = [("site.js", {"defer": "defer"})]
 exclude_patterns = ["_build", "README.md"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
