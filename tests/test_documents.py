@@ -296,7 +296,6 @@ def test_tables_fit_into_the_page(site, page):
     with opened((site / f"{page}.html").as_uri()) as driver:
         for size in ("desktop", "phone"):
             layout_faults(driver, size)
-            driver.refresh()
             assert driver.execute_script(WIDE_TABLES) == [], size
 
 
