@@ -127,7 +127,7 @@ types: setup ## Check the types
 layers: setup ## Check that dependencies point downward
 	@$(VENV)/bin/lint-imports
 
-docs: setup ## Build the documents as a site: docs/_build/index.html
+docs: setup ## Build the documents as a site, and run their notebooks where they changed (minutes): docs/_build/index.html
 	@$(VENV)/bin/python -m sphinx -q -W -b html docs docs/_build
 
 bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"

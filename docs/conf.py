@@ -22,13 +22,20 @@ html_show_copyright = False
 html_extra_path = ["llms.txt"]
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = [("site.js", {"defer": "defer"})]
 exclude_patterns = ["_build", "README.md"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 # Links to source files, which the site does not have; tests/test_documents.py checks that they exist.
 suppress_warnings = ["myst.xref_missing"]
-# Tests run the notebooks; here they are shown as they are.
-nb_execution_mode = "off"
+# Notebooks are kept without outputs. They run when the site is built, and again only once their cells have changed, or
+# after make clean.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / ".jupyter_cache")
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

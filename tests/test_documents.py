@@ -248,7 +248,9 @@ def site(tmp_path_factory):
     for needed in ("furo", "myst_nb", "sphinx_copybutton", "latex2mathml"):
         pytest.importorskip(needed)
     folder = tmp_path_factory.mktemp("site")
-    build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(folder)]
+    # Notebooks have tests of their own.
+    options = ("-q", "-W", "-b", "html", "-D", "nb_execution_mode=off")
+    build = [sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(folder)]
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder
@@ -281,6 +283,21 @@ def test_formulas_wrap_or_scroll_in_their_own_boxes_on_phones(site, page):
     with opened((site / f"{page}.html").as_uri()) as driver:
         layout_faults(driver, "phone")
         assert driver.execute_script(FORMULAS) == []
+
+
+WIDE_TABLES = """
+return [...document.querySelectorAll("table.docutils")]
+    .filter(table => table.scrollWidth > table.parentElement.clientWidth).map(table => table.textContent.slice(0, 60));
+"""
+
+
+@pytest.mark.minutes
+@pytest.mark.parametrize("page", ["settings", "article", "capture_formats", "measurements"])
+def test_tables_fit_into_the_page(site, page):
+    with opened((site / f"{page}.html").as_uri()) as driver:
+        for size in ("desktop", "phone"):
+            layout_faults(driver, size)
+            assert driver.execute_script(WIDE_TABLES) == [], size
 
 
 SMALLER = (

@@ -29,8 +29,8 @@ from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
-from nerf_lightning.runs.results import scene_name
-from nerf_lightning.runs.summary import read_note, read_run
+from nerf_lightning.runs.results import scene_of_run
+from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath
@@ -114,7 +114,7 @@ def run_context(
     corrected = checkpoint.choices.get("correction", "none") != "none"
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None
     keyframes = () if path is None else page_path(path, checkpoint.scene, run, content)
-    name = scene_name({"scene": checkpoint.scene.name}, checkpoint.choices, read_run(run).overrides)
+    name = scene_of_run(checkpoint.scene.name, run)
     return RunContext(photographs, neutral, tuple(known), keyframes, name)
 
 

@@ -17,9 +17,8 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.metrics import depth_scale, facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import Report, embedded, embedded_file, embedded_video
-from nerf_lightning.runs.results import scene_name
+from nerf_lightning.runs.results import scene_of_run
 from nerf_lightning.runs.summary import read_note
-from nerf_lightning.runs.summary import read_run as read_summary
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
@@ -157,8 +156,7 @@ def _add_coverage(report: Report, run: Path) -> None:
     if checkpoint is None:
         raise InputError(f"{run} has no checkpoint")
     record = checkpoint.scene
-    name = scene_name({"scene": record.name}, checkpoint.choices, read_summary(run).overrides)
-    report.title = name
+    report.title = scene_of_run(record.name, run)
     held = {split: record.splits.get(split, ()) for split in SPLITS}
     if held["val"] == held["test"]:
         del held["val"]

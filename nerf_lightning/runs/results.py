@@ -144,6 +144,11 @@ def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict
     return root.name or next((file.stem for file in files if file.stem), name)
 
 
+def scene_of_run(name: str, folder: Path) -> str:
+    """Return the name of the scene that a run trains on, whose record is called `name`."""
+    return scene_name({"scene": name}, _choices(folder), read_run(folder).overrides)
+
+
 def _choices(folder: Path) -> dict[str, Any]:
     """Return the picked scene and model, for results that do not name them."""
     try:

@@ -86,10 +86,10 @@ class Controls:
                 self.gui.add_markdown(NO_CROP)
                 return
             on = self.gui.add_checkbox("Show only what is in the box", False)
-            sliders = [
-                self.gui.add_multi_slider(axis, a, b, LEAST_SHARE * (b - a), (a, b), min_range=LEAST_SHARE * (b - a))
-                for axis, a, b in zip("xyz", *in_user_frame(record), strict=True)
-            ]
+            sliders = []
+            for axis, a, b in zip("xyz", *in_user_frame(record), strict=True):
+                least, lower, upper = rounded_range(a, b)
+                sliders.append(self.gui.add_multi_slider(axis, lower, upper, least, (lower, upper), min_range=least))
 
         def update(_: Any) -> None:
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
@@ -123,3 +123,14 @@ def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
     """Return the lower and upper corner of the scene's bounding box along the user's axes (user's units)."""
     places = points_to_user(torch.cartesian_prod(*record.aabb.unbind(dim=1)).double(), record.to_user.double())
     return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()
+
+
+def rounded_range(lower: float, upper: float) -> tuple[float, float, float]:
+    """Return a slider's step, about 1 % of a range, and the range widened to whole steps: numbers of few digits.
+
+    >>> rounded_range(-1.234567, 2.345678)
+    (0.04, -1.24, 2.36)
+    """
+    step = float(f"{LEAST_SHARE * (upper - lower):.0e}")
+    steps = math.floor(lower / step), math.ceil(upper / step)
+    return step, *(float(f"{count * step:.6g}") for count in steps)

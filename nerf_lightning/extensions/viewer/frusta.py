@@ -1,5 +1,6 @@
 """Draw over the picture: the cameras of the photographs, the crop box, and the camera path."""
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -17,9 +18,12 @@ from nerf_lightning.video.paths.recorded_path import RecordedPath
 
 ROOT, CAMERAS, BOX, PATH = "/overlay", "/overlay/cameras", "/overlay/crop", "/overlay/path"
 GREY, BLUE, ORANGE = (90, 90, 90), (40, 110, 220), (240, 120, 20)
-SCALE = 0.03  # Size of a frustum as a share of the photographs' distance.
+# Size of a frustum as a share of the photographs' distance, and its maximum as a share of that between neighbors.
+SCALE, OF_GAP = 0.02, 0.3
+LEAST_SCALE = 0.004  # Frames of a film are closer than frusta may be small.
 PIECES, MOST_PIECES = 24, 2000  # Segments of the path's line per leg, and maximum in total.
-INSIDE = 3.0  # A keyframe's camera within this many of its sizes would surround the viewer with lines: it is not drawn.
+INSIDE = 8.0  # A camera within this many of its sizes would hide the scene from the viewer: it is not drawn.
+THICKNESS = 1.5  # Of a frustum's lines (pixels).
 
 
 class Frusta:
@@ -27,21 +31,22 @@ class Frusta:
 
     def __init__(self, session: ViewerClient, on_click: Callable[[int], None]):
         self.session, self.scene = session, session.client.scene
-        self.size = SCALE * session.around.radius
+        self.size = frustum_size(session.photographs.record.cameras.c2w[:, :, 3], session.around.radius)
         self.root = self.scene.add_frame(ROOT, show_axes=False)
         self.cameras = self.scene.add_frame(CAMERAS, show_axes=False, visible=False)
         self.on_click, self.has_cameras = on_click, False
         self.box: Any = None
         self._path: list[Any] = []
         self._keyframes: list[tuple[Any, Tensor]] = []
+        self._photographed: list[tuple[Any, Tensor]] = []
         session.on_move = self._hide_around
 
     def show(self, visible: bool) -> None:
         """Show or hide the cameras of the photographs."""
         if visible and not self.has_cameras:
             self.has_cameras = True
-            for view in self.session.photographs.frustum_views:
-                self._add_camera(view)
+            self._photographed = [self._add_camera(view) for view in self.session.photographs.frustum_views]
+            self._hide_around()
         self.cameras.visible = visible
         self.session.draw_over("cameras", visible)
 
@@ -82,14 +87,14 @@ class Frusta:
         self.session.draw_over("path", bool(self._path))
 
     def _hide_around(self) -> None:
-        """Hide the keyframes around the user's viewpoint: after adding one, the user would look out of it."""
+        """Hide the cameras around the user's viewpoint, who would look out of them: after adding a keyframe, too."""
         here = self.session.pose()[:, 3]
-        for camera, place in list(self._keyframes):
+        for camera, place in (*self._photographed, *self._keyframes):
             shown = float((place - here).norm()) > INSIDE * self.size
             if camera.visible is not shown:
                 camera.visible = shown
 
-    def _add_camera(self, view: int) -> None:
+    def _add_camera(self, view: int) -> tuple[Any, Tensor]:
         photographs = self.session.photographs
         cameras = photographs.record.cameras
         shape = int(cameras.width[view]) / int(cameras.height[view])
@@ -97,6 +102,7 @@ class Frusta:
         image = None if thumbnail is None else thumbnail.numpy()
         handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, shape, GREY, image)
         handle.on_click(self.session.queue.errors.harmless(lambda _: self.on_click(view)))
+        return handle, cameras.c2w[view][:, 3]
 
     def _frustum(
         self,
@@ -108,7 +114,18 @@ class Frusta:
         image: UInt8[np.ndarray, "height width 3"] | None = None,
     ) -> Any:
         """Draw a camera as its viewing pyramid; `fov` is vertical, `aspect` is width over height."""
-        look = {"scale": self.size, "thickness": 0.02 * self.size, "color": color, "image": image}
+        look = {"scale": self.size, "thickness": THICKNESS, "thickness_units": "screen", "color": color, "image": image}
         shadows = {"cast_shadow": False, "receive_shadow": False}
         place = {"wxyz": quaternion_of(c2w), "position": c2w[:, 3].double().numpy()}
         return self.scene.add_camera_frustum(name, fov, aspect, **look, **shadows, **place)
+
+
+def frustum_size(places: Float[Tensor, "cameras 3"], radius: float) -> float:
+    """Return the size of frusta for cameras at these places, so that neighbors do not hide each other.
+
+    >>> row = torch.tensor([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    >>> [round(frustum_size(places, 1.0), 4) for places in (row, 20 * row, 0.01 * row)]
+    [0.015, 0.02, 0.004]
+    """
+    gaps = torch.cdist(places, places).fill_diagonal_(math.inf).amin(dim=1)
+    return radius * max(LEAST_SCALE, min(SCALE, OF_GAP * float(gaps.median()) / radius))

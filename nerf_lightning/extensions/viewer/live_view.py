@@ -90,8 +90,9 @@ class LiveView(Callback):
         # Other processes would wait for this one at their next step, but only for a limited time.
         self.switch = TrainingSwitch(can_pause=ranks.world_size() == 1)
         queue = RenderQueue(renderer)
-        run = folder.parent.name
-        self.page = Page(queue, photographs, folder, self.auth, self.port, self.max_height, self.switch, run=run)
+        self.page = Page(
+            queue, photographs, folder, self.auth, self.port, self.max_height, self.switch, run=folder.parent
+        )
         self.last = self.refreshed = time.perf_counter()
         # Its token is only for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", *tunnel(self.page.address), sep="\n", flush=True)

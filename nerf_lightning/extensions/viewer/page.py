@@ -18,6 +18,7 @@ from nerf_lightning.extensions.viewer.training_switch import TrainingSwitch
 from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.types.scene import SceneRecord
+from nerf_lightning.runs.results import scene_of_run
 from nerf_lightning.video.paths.base import frame_of
 
 # The initial view is this many times as far from the center as the first photograph: behind the cameras.
@@ -41,7 +42,7 @@ class Page:
         most_height: height of the finest image, in pixels.
         training: controls for the training that the page shows; None: no training.
         exports: folder of files that users can download; None: none.
-        run: name of the run's folder, which stands above the panel with the scene's name.
+        run: the run's folder, whose name stands above the panel with the scene's; None: the scene's alone.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Page:
         most_height: int,
         training: TrainingSwitch | None = None,
         exports: Path | None = None,
-        run: str = "",
+        run: Path | None = None,
     ) -> None:
         require_viser()
         self.queue, self.photographs, self.folder, self.auth = queue, photographs, folder, auth
@@ -65,7 +66,7 @@ class Page:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.server = guarded_server(auth, free_port(auth.host, port))
         # viser has no way to set the title of the browser's tab.
-        self.server.gui.set_panel_label(f"{record.name}, {run}" if run else record.name)
+        self.server.gui.set_panel_label(record.name if run is None else _title(record.name, run))
         self._dress(record)
         self.server.on_client_connect(queue.errors.harmless(self._welcome))
         self.server.on_client_disconnect(queue.errors.harmless(lambda client: queue.remove(client.client_id)))
@@ -117,3 +118,8 @@ class Page:
         shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])
         widest = math.radians(MOST_DEGREES)
         return min(fov_that_holds(vertical_field_of_view(cameras, 0), shape, window), widest)
+
+
+def _title(name: str, run: Path) -> str:
+    scene = scene_of_run(name, run)
+    return scene if scene == run.name else f"{scene}, {run.name}"

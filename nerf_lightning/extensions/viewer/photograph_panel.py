@@ -1,5 +1,6 @@
 """The panel's section for photographs: choose one by name, look through its camera, and compare it with its render."""
 
+from collections import Counter
 from typing import Any
 
 from nerf_lightning.extensions.viewer.client import ViewerClient
@@ -17,7 +18,10 @@ class PhotographPanel:
         self.session, self.frusta = session, frusta
         self.names = session.photographs.record.view_names
         gui, harmless = session.client.gui, session.queue.errors.harmless
-        labels = (f"{view}: {for_terminal(name, MOST_LETTERS)}" for view, name in enumerate(self.names))
+        short = [for_terminal(name, MOST_LETTERS) for name in self.names]
+        # viser knows options by their text, so names that are shortened alike get a number.
+        count = Counter([NONE, *short])
+        labels = [f"{view}: {name}" if count[name] > 1 else name for view, name in enumerate(short)]
         with gui.add_folder("Photographs", expand_by_default=False):
             visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
             self.choice = gui.add_dropdown("View from", (NONE, *labels), initial_value=NONE)
@@ -25,7 +29,7 @@ class PhotographPanel:
             self.split = gui.add_slider(
                 "Photograph | render", 0.0, 1.0, 0.01, session.split, visible=False, hint="Left is the photograph"
             )
-            self.leave = gui.add_button("Leave", visible=False)
+            self.leave = gui.add_button("Leave photograph", visible=False)
         visible.on_update(harmless(lambda _: self.frusta.show(visible.value)))
         self.choice.on_update(harmless(self._choose))
         self.split.on_update(harmless(self._compare))

@@ -34,8 +34,8 @@ def run(config: DictConfig) -> None:
     queue = RenderQueue(renderer)
     photographs = Photographs(record, scene, background)
     exports = beside_checkpoint(opened.checkpoint.path, "export")
-    name = exports.parent.name
-    page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports, run=name)
+    run_folder = exports.parent
+    page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports, run=run_folder)
     stopped = received_stop_signals()
     say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page does not need them to start
