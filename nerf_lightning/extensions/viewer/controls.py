@@ -132,5 +132,5 @@ def rounded_range(lower: float, upper: float) -> tuple[float, float, float]:
     (0.04, -1.24, 2.36)
     """
     step = float(f"{LEAST_SHARE * (upper - lower):.0e}")
-    steps = math.floor(lower / step), math.ceil(upper / step)
-    return step, *(float(f"{count * step:.6g}") for count in steps)
+    low, high = math.floor(lower / step) * step, math.ceil(upper / step) * step
+    return step, float(f"{low:.6g}"), float(f"{high:.6g}")
