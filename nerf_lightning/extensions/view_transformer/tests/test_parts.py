@@ -73,7 +73,7 @@ def test_samples_lie_where_points_are_projected(lens_model, lens):
         for source, view in enumerate(places[ray].tolist()):
             seen = found.visible[ray, :, source]
             expected = project(exact, view, points[ray])[seen]
-            torch.testing.assert_close(found.at[ray, seen, source].double(), expected, atol=1e-4, rtol=0)
+            torch.testing.assert_close(found.xy[ray, seen, source].double(), expected, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("key", [None, *range(20)])
