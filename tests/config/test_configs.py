@@ -199,7 +199,7 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
         ("report", "max_megabytes=many", "a number"),
         ("table", "force=3", "true or false"),
         ("train", "seed=null", "a number"),
-        ("bench", "rounds=true", "a number"),
+        ("poses", "max_image_size=true", "a number"),
     ],
 )
 def test_a_commands_own_numbers_and_switches_take_no_other_kind(command, override, kind):
