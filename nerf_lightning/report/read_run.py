@@ -160,7 +160,7 @@ def _add_coverage(report: Report, run: Path) -> None:
     held = {split: record.splits.get(split, ()) for split in SPLITS}
     if held["val"] == held["test"]:
         del held["val"]
-    *most, last = [f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers]
-    views = f"{', '.join(most)} and {last}" if most else last
+    counts = [f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers]
+    views = " and ".join(filter(None, (", ".join(counts[:-1]), *counts[-1:])))
     report.subtitle = f"model {checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
     report.coverage = embedded(coverage_picture(record).numpy())
