@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from nerf_lightning.config.compose import Composed, compose_config
+from nerf_lightning.config.compose import Composed
 from nerf_lightning.config.model_for_scene import (
     IN_A_BOX,
     LARGE,
@@ -299,7 +299,7 @@ def resolve_correction(requested: Composed, finding: str | None = None) -> Compo
     name = "exposure" if cause else "none"
     if cause:
         log.info("correction: exposure, since %s (correction=none leaves colors unchanged)", cause)
-        exposure = compose_config(requested.command, [*requested.overrides, "correction=exposure"]).config.correction
+        exposure = requested.composed_with(["correction=exposure"]).config.correction
         requested = requested.with_setting("correction", exposure)
     return replace(requested, choices={**requested.choices, "correction": name})
 
