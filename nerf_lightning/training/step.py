@@ -17,12 +17,13 @@ from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.optimizers.groups import BuildOptimizer, optimizer_of
 from nerf_lightning.nerf.optimizers.schedule import Schedule
+from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average, end_step
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
 from nerf_lightning.nerf.types.rays import Batch
-from nerf_lightning.training.gradients.recorded import RecordedGradients
+from nerf_lightning.training.gradients.recorded import RecordedGradients, Rest
 from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard
 
@@ -98,26 +99,70 @@ class TrainStep:
         with self.tiles.on_threads(self.device):
             optimizer.zero_grad()
             begin_step(objective, StepContext(progress.step / self.num_steps, progress.step, self.key))
-            first = ranks.share(progress.batch_rays // objective.pixels_per_patch).start * objective.pixels_per_patch
-            share = Share(first, progress.batch_rays, ranks.total(batch.weight.sum()))
-            seen = self.gradients(batch, self.key, share, backward)
-            ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
-            ranks.add_up_gradients(objective.parameters())
-            if self.gradients.guards or self.guard.allows(seen.losses, objective.named_weights()):
-                if measure_gradients:
-                    seen = replace(seen, gradient_norms=_norms(objective.model))
-                if self.clip_norm is not None:
-                    clip_grad_norm_(objective.parameters(), self.clip_norm)
-                factor = self.schedule(progress.step, self.num_steps)
-                for group in optimizer.param_groups:
-                    group["lr"] = factor * group.setdefault("base_lr", group["lr"])
-                optimizer.step()
+            factor = self.schedule(progress.step, self.num_steps)
+            for group in optimizer.param_groups:
+                group["lr"] = factor * group.setdefault("base_lr", group["lr"])
+            if isinstance(self.gradients, RecordedGradients):
+                taken, seen = True, self._replayed(self.gradients, batch, optimizer, backward, measure_gradients)
+            else:
+                seen = self.gradients(batch, self.key, self._share(batch), backward)
+                self._add_up(seen)
+                taken = self.guard.allows(seen.losses, objective.named_weights())
+                if taken:
+                    seen = self._clipped(seen, measure_gradients)
+                    optimizer.step()
+            if taken:
                 end_step(objective, seen.rgb, seen.target, seen.weight)
-                ranks.average(buffers_to_average(objective.loss))
-            progress.advance(share.num_rays)
+                if ranks.world_size() > 1:
+                    ranks.average(buffers_to_average(objective.loss))
+            progress.advance(progress.batch_rays)
             if progress.step == 1 or progress.step % BATCH_STEPS == 0:
                 self._choose_batch()
             return seen
+
+    def _share(self, batch: Batch) -> Share | None:
+        """Return this process's share of the batch; None: all of it."""
+        if ranks.world_size() == 1:
+            return None
+        first = ranks.share(self.progress.batch_rays // self.objective.pixels_per_patch).start
+        return Share(first * self.objective.pixels_per_patch, self.progress.batch_rays, ranks.total(batch.weight.sum()))
+
+    def _replayed(
+        self, gradients: RecordedGradients, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool
+    ) -> StepOutput:
+        """Replay a step, with its update if the optimizer's can be recorded; the guard zeroes nonfinite gradients."""
+        inner = getattr(optimizer, "optimizer", optimizer)  # Lightning's wrapper counts the steps
+        recorded = inner if isinstance(inner, TableAdam) else None
+        outputs: list[StepOutput] = []
+
+        def finish(seen: StepOutput) -> StepOutput:
+            self.guard.keep_finite(seen.losses, self.objective.named_weights())
+            seen = self._clipped(seen, measure_gradients)
+            if recorded is not None:
+                recorded.update()
+            return seen
+
+        def compute() -> None:
+            update = None if recorded is None else recorded.next_update
+            changes = [*self.guard.tensors(batch.weight.device), *(() if update is None else update.tensors())]
+            rest = Rest(self._add_up, finish, changes, kind=(measure_gradients, update))
+            outputs.append(gradients(batch, self.key, self._share(batch), backward, rest))
+            if recorded is not None:
+                recorded.gradients_are_zero()
+
+        optimizer.step(compute)
+        return outputs[0]
+
+    def _add_up(self, seen: StepOutput) -> None:
+        ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
+        ranks.add_up_gradients(self.objective.parameters())
+
+    def _clipped(self, seen: StepOutput, measure_gradients: bool) -> StepOutput:
+        if measure_gradients:
+            seen = replace(seen, gradient_norms=_norms(self.objective.model))
+        if self.clip_norm is not None:
+            clip_grad_norm_(self.objective.parameters(), self.clip_norm)
+        return seen
 
     def _choose_batch(self) -> None:
         """Choose the number of rays of the next steps by the number of samples per ray."""
@@ -134,7 +179,7 @@ class TrainStep:
             InputError: it was requested, but a part decides on the host what a step computes.
         """
         if self.gradients is self.tiles and self.records is not None and self.records(self):
-            self.gradients = RecordedGradients(self.tiles, self.guard)
+            self.gradients = RecordedGradients(self.tiles)
 
     def new_optimizer(self) -> Optimizer:
         """Return the optimizer of all parameters.

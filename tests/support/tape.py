@@ -58,7 +58,7 @@ def tape(work):
 
 def replay_steps(train_step: TrainStep, record=tape) -> None:
     """Record steps from now on, and replay them."""
-    train_step.gradients = RecordedGradients(train_step.tiles, train_step.guard, record)
+    train_step.gradients = RecordedGradients(train_step.tiles, record)
 
 
 @contextmanager

@@ -55,9 +55,10 @@ def check_table_adam(kernels, device, generator, rays):
         found.append(rows)
     found[0][1, 4] = torch.nan
     given = [rows.clone() for rows in found]
-    numbers = 1e-2, 1.3, (0.9, 0.99), 1e-15
-    for _ in range(2):  # the second finds the addresses known
-        kernels.adam_steps([rows.unbind() for rows in found], *numbers)
+    numbers = 1e-2, 1.3, 0.9, 0.99, 1e-15
+    table, of_all = kernels.address_table([rows.unbind() for rows in found]), torch.tensor([numbers] * len(found))
+    for _ in range(2):
+        kernels.adam_steps(*table, of_all.to(device))
         assert not any(rows[1].any() for rows in found)
         for rows, before in zip(found, given, strict=True):
             expected = before.double()

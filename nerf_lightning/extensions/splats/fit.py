@@ -18,7 +18,7 @@ from nerf_lightning.extensions.splats.gaussians import Gaussians, Pinhole
 from nerf_lightning.extensions.splats.rasterizer import rasterize
 from nerf_lightning.extensions.splats.views import View, color_behind
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
-from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
+from nerf_lightning.nerf.kernels.table_adam.op import AdamUpdate
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.types.scene import DRAWN, Background
 
@@ -109,12 +109,15 @@ class _State:
         self.step += 1
         b1, b2 = BETAS
         root_scale = (1 - b2**self.step) ** -0.5
+        rows, numbers = [], []
         for name, tensor in self.gaussians.tensors().items():
             assert tensor.grad is not None
-            first, second = getattr(self.first, name), getattr(self.second, name)
-            step_size = rate * self.rates[name] / (1 - b1**self.step)
-            adam_steps([(tensor, tensor.grad, first, second)], step_size, root_scale, BETAS, EPS)
+            rows.append((tensor, tensor.grad, getattr(self.first, name), getattr(self.second, name)))
+            numbers.append((rate * self.rates[name] / (1 - b1**self.step), root_scale, b1, b2, EPS))
             tensor.grad = None
+        update = AdamUpdate(rows)
+        update.set_numbers(numbers)
+        update()
         self.gaussians.log_scales.detach().clamp_(min=self.finest[:, None])
         return float(loss.detach())
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
+from nerf_lightning.nerf.kernels.table_adam.op import AdamUpdate, addresses
 
 
 class TableAdam(Optimizer):
@@ -44,6 +44,7 @@ class TableAdam(Optimizer):
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps, "weight_decay": weight_decay})
         # Shared with copies of this optimizer's attributes, such as Lightning's wrapper.
         self._gradients = {"are_zero": False}
+        self.next_update: AdamUpdate | None = None  # of the present parameters, gradients and moments
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Set the gradients to zero unless the last step has; they stay allocated, whatever `set_to_none`."""
@@ -57,14 +58,41 @@ class TableAdam(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Update the touched entries, and set their gradients to zero."""
+        """Update the touched entries, and set their gradients to zero.
+
+        Args:
+            closure: computes the gradients; if it also replays a recorded `update`, it calls `gradients_are_zero`.
+        """
+        self._count_step()
+        self._gradients["are_zero"] = False
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        if not self._gradients["are_zero"]:
+            self.update()
+        return loss
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Update with the numbers of the present step, which lie on the device: this can be recorded and replayed."""
+        for group in self.param_groups:
+            for parameter in group["params"] if group["weight_decay"] else ():
+                if parameter.grad is not None:
+                    parameter.grad.add_(parameter, alpha=group["weight_decay"])
+        if self.next_update is not None:
+            self.next_update()
+        self.gradients_are_zero()
+
+    def gradients_are_zero(self) -> None:
+        """Note that the step's update has been made, and has left zeros."""
+        self._gradients["are_zero"] = True
+
+    def _count_step(self) -> None:
+        """Count a step, and set its numbers."""
+        rows, numbers = [], []
         for group in self.param_groups:
             beta1, beta2 = group["betas"]
-            together: dict[int, list[tuple[Tensor, Tensor, Tensor, Tensor]]] = {}
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
@@ -73,21 +101,16 @@ class TableAdam(Optimizer):
                     state["step"] = 0
                     state["exp_avg"] = torch.zeros_like(parameter)
                     state["exp_avg_sq"] = torch.zeros_like(parameter)
-                state["step"] += 1
-                if group["weight_decay"]:
-                    parameter.grad.add_(parameter, alpha=group["weight_decay"])
-                arrays = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
-                together.setdefault(state["step"], []).append(arrays)
-            for step, rows in together.items():
-                adam_steps(
-                    rows,
-                    step_size=group["lr"] / (1.0 - beta1**step),
-                    root_scale=1.0 / math.sqrt(1.0 - beta2**step),
-                    betas=(beta1, beta2),
-                    eps=group["eps"],
-                )
-        self._gradients["are_zero"] = True
-        return loss
+                state["step"] = step = state["step"] + 1
+                rows.append((parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]))
+                rates = group["lr"] / (1.0 - beta1**step), 1.0 / math.sqrt(1.0 - beta2**step)
+                numbers.append((*rates, beta1, beta2, group["eps"]))
+        if not rows:
+            self.next_update = None
+            return
+        if self.next_update is None or self.next_update.addresses != addresses(rows):
+            self.next_update = AdamUpdate(rows)
+        self.next_update.set_numbers(numbers)
 
     def _parameters(self) -> Iterable[Tensor]:
         return (parameter for group in self.param_groups for parameter in group["params"])

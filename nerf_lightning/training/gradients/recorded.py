@@ -1,4 +1,4 @@
-"""A batch's forward and backward pass, recorded once as a CUDA graph and replayed for each batch of its size.
+"""A batch's forward and backward pass and the update, recorded once as a CUDA graph and replayed for each batch.
 
 A step of a small model launches hundreds of kernels that each take a few microseconds, and Python takes longer to
 launch them than the GPU to compute. A replayed graph is launched once
@@ -10,7 +10,7 @@ each decision of a model on the host has its own recordings (`Part.step_variant`
 """
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,6 @@ from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.part import parts_of, sample_counts
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
-from nerf_lightning.training.step_guard import StepGuard
 
 KNOWN = (__name__.partition(".")[0], "torch")
 """Packages for whose modules it is known whether recorded steps can be replayed."""
@@ -65,14 +64,30 @@ class CudaGraphs:
 
 
 @dataclass(frozen=True)
+class Rest:
+    """The rest of a step, after its gradients."""
+
+    add_up: Callable[[StepOutput], None]
+    """Sums outputs and gradients over the processes."""
+    finish: Callable[[StepOutput], StepOutput]
+    """Recorded, too: uses the gradients."""
+    changes: Sequence[Tensor]
+    """What `finish` changes besides the gradients."""
+    kind: Hashable
+    """Differs where `finish` does something else."""
+
+
+@dataclass(frozen=True)
 class _Recording:
     """A recording for one batch size."""
 
     batch: Batch
-    weight: Tensor
+    share: Share | None
     key: Tensor
     replay: Callable[[], None]
     output: StepOutput
+    finish: Callable[[], None] | None
+    """Replays the rest of the step, if `replay` does not."""
     gradients: list[Tensor | None]
 
 
@@ -81,97 +96,117 @@ class RecordedGradients:
 
     Args:
         tiles: computes the gradients.
-        guard: sets a step's nonfinite gradients to zero, if one process has all of them.
         record: makes a recording; None: CUDA graphs.
 
     Raises:
         InputError: a part decides on the host what a step computes.
     """
 
-    guards: bool
-    """Whether nonfinite gradients have already been set to zero."""
     replays = True
     """Whether batches are replayed, until a recording is refused."""
 
-    def __init__(self, tiles: TileGradients, guard: StepGuard, record: Recorder | None = None):
+    def __init__(self, tiles: TileGradients, record: Recorder | None = None):
         if kinds := not_replayed(tiles.objective):
             raise InputError(
                 "trainer.cuda_graph=true replays the same kernels in each step, and these may want others in another "
                 f"step: {', '.join(kinds)}. Leave it out."
             )
-        self.tiles, self.guard, self.record = tiles, guard, CudaGraphs() if record is None else record
+        self.tiles, self.record = tiles, CudaGraphs() if record is None else record
         self.parts, self.parameters = list(parts_of(tiles.objective)), list(tiles.objective.parameters())
-        self.guards = ranks.world_size() == 1  # else the gradients of all processes are summed first
         self.recordings: dict[tuple[int, Hashable], _Recording] = {}
 
     def __call__(
-        self, batch: Batch, key: int, share: Share | None = None, backward: Backward = torch_backward
+        self,
+        batch: Batch,
+        key: int,
+        share: Share | None = None,
+        backward: Backward = torch_backward,
+        rest: Rest | None = None,
     ) -> StepOutput:
         """Return a batch's output; its gradients replace the previous ones in the parameters.
 
         The next call overwrites both. If batches cannot be recorded, this does the same as `TileGradients`, which has
-        the same arguments.
+        the same arguments, and the rest of the step, if there is one.
         """
         if self.replays:
             try:
-                return self._replayed(batch, key, Share.whole(batch) if share is None else share)
+                return self._replayed(batch, key, share, rest)
             except RuntimeError as error:
                 if not is_out_of_memory(error) and "captur" not in str(error):
                     raise
                 cause = "there is no memory" if is_out_of_memory(error) else f"CUDA refuses: {error}".splitlines()[0]
             log.warning("Steps are not recorded: %s. The kernels of each step are launched one by one.", cause)
-            self.guards = self.replays = False
+            self.replays = False
             self.recordings.clear()
             self.tiles.objective.zero_grad(set_to_none=False)
-        return self.tiles(batch, key, share, backward)
+        seen = self.tiles(batch, key, share, backward)
+        if rest is None:
+            return seen
+        rest.add_up(seen)
+        return rest.finish(seen)
 
-    def _replayed(self, batch: Batch, key: int, share: Share) -> StepOutput:
-        kind = batch.num_rays, (share.first, share.num_rays, *(part.step_variant for part in self.parts))
+    def _replayed(self, batch: Batch, key: int, share: Share | None, rest: Rest | None) -> StepOutput:
+        of_share = None if share is None else (share.first, share.num_rays)
+        variants = of_share, None if rest is None else rest.kind, *(part.step_variant for part in self.parts)
+        kind = batch.num_rays, variants
         if kind not in self.recordings:
-            self.recordings[kind] = self._recorded(batch, key, share)
+            self.recordings[kind] = self._recorded(batch, key, share, rest)
         kept = self.recordings[kind]
-        _copy([*kept.batch.tensors(), kept.weight], [*batch.tensors(), share.weight])
+        _copy(_inputs(kept.batch, kept.share), _inputs(batch, share))
         kept.key.fill_(key)
         kept.replay()
+        if kept.finish is not None and rest is not None:
+            rest.add_up(kept.output)
+            kept.finish()
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
         return kept.output
 
-    def _recorded(self, batch: Batch, key: int, share: Share) -> _Recording:
-        batch, weight = batch.map(Tensor.clone), share.weight.clone()
-        kept_key, share = torch.full((), key, device=weight.device), replace(share, weight=weight)
+    def _recorded(self, batch: Batch, key: int, share: Share | None, rest: Rest | None) -> _Recording:
+        batch = batch.map(Tensor.clone)
+        share = None if share is None else replace(share, weight=share.weight.clone())
+        kept_key = torch.full((), key, device=batch.weight.device)
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-        counts = [*sample_counts(self.tiles.objective), *self.guard.tensors(weight.device)]
-        before = [count.clone() for count in counts]
+        changed = [*sample_counts(self.tiles.objective), *([] if rest is None else rest.changes)]
+        before = [each.clone() for each in changed]
+        # Sums over processes are not recorded: what precedes them and what follows are replayed one after another.
+        together = rest is None or ranks.world_size() == 1
 
         def work() -> StepOutput:
-            for parameter in self.parameters:
-                # Others are zero already: the optimizer leaves them so (`optimizers.table_adam`).
-                if parameter.grad is not None and not getattr(parameter, "grad_in_place", False):
-                    parameter.grad.zero_()
-            seen = self.tiles.in_tiles_of(batch.num_rays, batch, share, kept_key)
-            if self.guards:
-                self.guard.keep_finite(seen.losses, self.tiles.objective.named_weights())
-            return seen
+            self._zero_gradients()
+            whole = Share.whole(batch) if share is None else share
+            seen = self.tiles.in_tiles_of(batch.num_rays, batch, whole, kept_key)
+            return rest.finish(seen) if rest is not None and together else seen
 
+        finish = None
         try:
             replay, seen = self.record(work)
+            if rest is not None and not together:
+                of_gradients, whole_step = seen, rest
+                finish, seen = self.record(lambda: whole_step.finish(of_gradients))
         finally:
-            for count, former in zip(counts, before, strict=True):
-                count.copy_(former)
+            for each, former in zip(changed, before, strict=True):
+                each.copy_(former)
+        self._zero_gradients(all_of_them=True)
+        return _Recording(batch, share, kept_key, replay, seen, finish, [each.grad for each in self.parameters])
+
+    def _zero_gradients(self, all_of_them: bool = False) -> None:
         for parameter in self.parameters:
-            if parameter.grad is not None:
+            # Others are zero already: the optimizer leaves them so (`optimizers.table_adam`).
+            if parameter.grad is not None and (all_of_them or not getattr(parameter, "grad_in_place", False)):
                 parameter.grad.zero_()
-        return _Recording(batch, weight, kept_key, replay, seen, [parameter.grad for parameter in self.parameters])
+
+
+def _inputs(batch: Batch, share: Share | None) -> list[Tensor]:
+    return [*batch.tensors(), *([] if share is None else [share.weight])]
 
 
 def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
-    """Copy tensors, those of one dtype in one kernel."""
-    for dtype in {each.dtype for each in targets}:
-        ours, theirs = ([each for each in tensors if each.dtype == dtype] for tensors in (targets, sources))
-        torch._foreach_copy_(ours, theirs)
+    """Copy tensors, whatever their types, in one kernel."""
+    ours, theirs = ([each.contiguous().view(torch.int32) for each in tensors] for tensors in (targets, sources))
+    torch._foreach_copy_(ours, theirs)
 
 
 def not_replayed(objective: Objective, only_known: bool = False) -> list[str]:

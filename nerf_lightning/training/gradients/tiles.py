@@ -67,7 +67,7 @@ class TileGradients:
         jitter: False: no random numbers.
     """
 
-    guards = replays = False  # see `RecordedGradients`
+    replays = False  # see `RecordedGradients`
 
     def __init__(self, objective: Objective, points: int | None, jitter: bool = True):
         self.objective, self.jitter = objective, jitter

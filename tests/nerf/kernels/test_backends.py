@@ -15,7 +15,7 @@ from support.running import start_code
 from support.systems import POSIX
 
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.table_adam.op import adam_steps
+from nerf_lightning.nerf.kernels.table_adam.op import AdamUpdate
 
 
 @pytest.fixture
@@ -51,7 +51,9 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     )
     parameter, grad = torch.ones(3), torch.tensor([1.0, 0.0, -1.0])
     for _ in range(2):
-        adam_steps([(parameter, grad.clone(), torch.zeros(3), torch.zeros(3))], 0.5, 1.0, (0.0, 0.0), 1e-15)
+        update = AdamUpdate([(parameter, grad.clone(), torch.zeros(3), torch.zeros(3))])
+        update.set_numbers([(0.5, 1.0, 0.0, 0.0, 1e-15)])
+        update()
     torch.testing.assert_close(parameter, torch.tensor([0.0, 1.0, 2.0]))
     assert backends.why_not("nerf_lightning.nerf.kernels.table_adam.cpu") == "RuntimeError: LLVM cannot select this"
     assert len(caplog.records) == 1

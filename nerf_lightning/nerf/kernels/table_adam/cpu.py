@@ -25,12 +25,13 @@ def adam_step(
     second: Tensor,
     step_size: float,
     root_scale: float,
-    betas: tuple[float, float],
+    beta1: float,
+    beta2: float,
     eps: float,
 ) -> None:
     """Update contiguous float32 arrays in place."""
     arrays = [x.view(-1).numpy() for x in (parameter, grad, first, second)]
-    numbers = [np.float32(x) for x in (step_size, root_scale, *betas, eps)]
+    numbers = [np.float32(x) for x in (step_size, root_scale, beta1, beta2, eps)]
     vectors, rest = divmod(parameter.numel(), LANES)
     over_rows(_update_vectors, vectors, *arrays, *numbers)
     if rest:  # in a separate vector, padded with zeros
@@ -44,7 +45,7 @@ def adam_step(
 
 def trial() -> None:
     """Run the kernel once on tiny input; it raises whatever the compiler raises."""
-    adam_step(torch.ones(4), torch.ones(4), torch.zeros(4), torch.zeros(4), 0.1, 1.0, (0.9, 0.99), 1e-15)
+    adam_step(torch.ones(4), torch.ones(4), torch.zeros(4), torch.zeros(4), 0.1, 1.0, 0.9, 0.99, 1e-15)
 
 
 @intrinsic

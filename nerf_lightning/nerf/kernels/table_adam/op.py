@@ -8,33 +8,52 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 
+Row = tuple[Tensor, Tensor, Tensor, Tensor]
+"""A parameter, its gradient and its two moments."""
 
-def adam_steps(
-    parameters: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
-    step_size: float,
-    root_scale: float,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    """Take the step of `adam_step_torch` for several parameters on one device; on CUDA in one kernel.
+
+class AdamUpdate:
+    """The step of `adam_step_torch` for several parameters on one device; on CUDA in one kernel.
+
+    The numbers that vary between steps lie on the device, so a recorded update can be replayed.
 
     Args:
-        parameters: each with its gradient and its two moments.
-        step_size: see `adam_step_torch`, also for the others.
-        root_scale: the same for all parameters.
-        betas: b1, b2.
-        eps: keeps the quotient finite.
+        rows: each parameter with its gradient and its two moments.
     """
-    numbers, device = (step_size, root_scale, betas, eps), parameters[0][0].device
-    rows = [(row[0].detach(), *row[1:]) for row in parameters]
-    suits = [all(x.is_contiguous() and x.dtype == torch.float32 for x in row) for row in rows]
-    cuda = cuda_backend("table_adam.cuda", device) if all(suits) else None
-    if cuda is not None:
-        cuda.adam_steps(rows, *numbers)
-        return
-    cpu = cpu_backend("table_adam.cpu", device)
-    for row, suitable in zip(rows, suits, strict=True):
-        (cpu.adam_step if cpu is not None and suitable else adam_step_torch)(*row, *numbers)
+
+    def __init__(self, rows: Sequence[Row]):
+        self.addresses = addresses(rows)
+        self.rows = [(row[0].detach(), *row[1:]) for row in rows]
+        device = rows[0][0].device
+        self.numbers = torch.zeros(len(rows), 5, dtype=torch.float64 if device.type == "cpu" else None, device=device)
+        self.suits = [all(x.is_contiguous() and x.dtype == torch.float32 for x in row) for row in self.rows]
+        self.cuda = cuda_backend("table_adam.cuda", device) if all(self.suits) else None
+        self.table: tuple[Tensor, ...] = () if self.cuda is None else self.cuda.address_table(self.rows)
+
+    def set_numbers(self, numbers: Sequence[tuple[float, float, float, float, float]]) -> None:
+        """Set each parameter's step_size, root_scale, b1, b2 and eps."""
+        self.numbers.copy_(torch.tensor(numbers, dtype=self.numbers.dtype), non_blocking=True)
+
+    def __call__(self) -> None:
+        """Update the parameters in place."""
+        if self.cuda is not None:
+            self.cuda.adam_steps(*self.table, self.numbers)
+            return
+        cpu = cpu_backend("table_adam.cpu", self.numbers.device)
+        for row, suitable, numbers in zip(self.rows, self.suits, self.numbers, strict=True):
+            if cpu is not None and suitable:
+                cpu.adam_step(*row, *numbers.tolist())
+            else:
+                adam_step_torch(*row, *numbers)
+
+    def tensors(self) -> list[Tensor]:
+        """Return what an update changes besides the gradients."""
+        return [array for row in self.rows for array in (row[0], *row[2:])]
+
+
+def addresses(rows: Sequence[Row]) -> list[int]:
+    """Return where arrays are: an `AdamUpdate` is for arrays that stay there."""
+    return [array.data_ptr() for row in rows for array in row]
 
 
 def adam_step_torch(
@@ -42,10 +61,11 @@ def adam_step_torch(
     grad: Float[Tensor, "*n"],
     first: Float[Tensor, "*n"],
     second: Float[Tensor, "*n"],
-    step_size: float,
-    root_scale: float,
-    betas: tuple[float, float],
-    eps: float,
+    step_size: float | Float[Tensor, ""],
+    root_scale: float | Float[Tensor, ""],
+    beta1: float | Float[Tensor, ""],
+    beta2: float | Float[Tensor, ""],
+    eps: float | Float[Tensor, ""],
 ) -> None:
     """Update in place: m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= step_size m / (root_scale sqrt(v) + eps).
 
@@ -58,11 +78,12 @@ def adam_step_torch(
         second: v.
         step_size: learning rate over (1 - b1^t).
         root_scale: 1 / sqrt(1 - b2^t).
-        betas: b1, b2.
+        beta1: b1.
+        beta2: b2.
         eps: keeps the quotient finite.
     """
     touched = (grad != 0).to(grad.dtype)
-    first.add_(touched * (1.0 - betas[0]) * (grad - first))
-    second.add_(touched * (1.0 - betas[1]) * (grad * grad - second))
+    first.add_(touched * (1.0 - beta1) * (grad - first))
+    second.add_(touched * (1.0 - beta2) * (grad * grad - second))
     parameter.sub_(touched * step_size * first / (second.sqrt() * root_scale + eps))
     grad.zero_()
