@@ -124,7 +124,7 @@ def check_march(kernels, device, generator, rays):
 
 def some_ragged_samples(device, generator, rays, padding):
     counts = torch.randint(0, 90, (rays,), generator=generator)
-    counts[-3:] = torch.tensor([0, 1, 32])[-rays:]
+    counts[-3:] = torch.tensor([0, 1, 32])[3 - min(rays, 3) :]
     bounds = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     total = int(bounds[-1])
     index = torch.cat([torch.arange(rays).repeat_interleave(counts), torch.arange(padding) % rays])
@@ -240,11 +240,7 @@ def check_render(kernels, device, generator, rays):
             field.color_mlp[-1].data *= 30.0  # some colors are nearly black, or full
             field.least_slope = 0.003
             field.to(device)
-            origins = torch.tensor([0.0, 0.0, -2.0]) + 0.5 * torch.randn(rays, 3, generator=generator)
-            directions = torch.nn.functional.normalize(
-                0.3 * torch.randn(rays, 3, generator=generator) - origins, dim=-1
-            )
-            bundle = RayBundle(origins, directions, origins[:, 0], origins[:, 0], directions).to(device)
+            bundle = some_rays(generator, rays).to(device)
             parts = field.parts()
             parts = parts if colored else replace(parts, color_weights=[])
             with forced():
@@ -266,6 +262,62 @@ def check_render(kernels, device, generator, rays):
             others = [parameter.grad for parameter in field.parameters() if parameter.grad is not None]
             for one, other in zip(gradients, others, strict=True):
                 assert float((one - other).norm()) <= 1e-4 * float(other.norm()), (one.shape, contracted, colored)
+
+
+def check_field(kernels, device, generator, rays):
+    """Both MLPs in one pass against each by itself, which rounds the same numbers to bfloat16, but for gradients."""
+    few = max(1, rays // 5)
+    for samples_of, count, colored, contracted, whole_from, slope in (
+        (some_dense_samples, few, True, True, 3.0, 0.003),
+        (some_ragged_samples, few, True, False, 0.0, 0.0),
+        (some_ragged_samples, 1, False, False, 0.0, 0.0),
+        (some_ragged_samples, 0, True, False, 0.0, 0.0),
+    ):
+        samples = samples_of(device, generator, count, padding=300 if count else 0)
+        field = NGPField(
+            HashGridEncoder(4, 4, 8, 4, 32), SphericalHarmonicsEncoder(), width=32, feature_dim=12, color_layers=1,
+            contraction=contracted,
+        )  # fmt: skip
+        for parameter in field.parameters():
+            parameter.data.uniform_(-0.5, 0.5, generator=generator)
+        field.aabb.copy_(1.5 * torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        field.least_slope = slope
+        field.to(device)
+        bundle = some_rays(generator, count).to(device)
+        parts = field.parts() if colored else replace(field.parts(), color_weights=[])
+        (found, gradients), (expected, others) = (
+            rendered_with(fused, field, parts, bundle, samples, whole_from) for fused in (kernels, None)
+        )
+        assert len(gradients) == len(others)
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=2e-3, atol=2e-4)
+        for one, other in zip(gradients, others, strict=True):
+            assert float((one - other).norm()) <= 1e-2 * float(other.norm()), (one.shape, colored)  # bfloat16: 2^-8
+    assert not kernels.takes((32, 64, 16), (32, 64, 64, 3), torch.device(device))
+    assert not kernels.takes((32, 128, 16), (32, 64, 3), torch.device(device))
+
+
+def rendered_with(fused, field, parts, rays, samples, whole_from):
+    """Return integrals, and gradients of the field's weights; None: with a kernel for each MLP."""
+    from nerf_lightning.nerf.kernels.mlp import cuda as mlps
+    from nerf_lightning.nerf.kernels.mlp.op import _TiledMLP
+    from nerf_lightning.nerf.kernels.render import cuda as render
+
+    def single(points, weights, *_):
+        return _TiledMLP.apply(points, mlps, torch.float32, (), *weights)
+
+    field.zero_grad()
+    with forced(), patch.object(render, "cuda_backend", lambda *given: fused), patch.object(render, "mlp", single):
+        assert render._fused(parts, rays, "bfloat16") is fused
+        found = render.render(rays, samples, parts, "bfloat16", True, whole_from, None)
+    torch.autograd.backward(found, [torch.arange(each.numel()).sin().to(each).view(each.shape) for each in found])
+    return found, [each.grad.clone() for each in field.parameters() if each.grad is not None]
+
+
+def some_rays(generator, count):
+    origins = torch.tensor([0.0, 0.0, -2.0]) + 0.5 * torch.randn(count, 3, generator=generator)
+    directions = torch.nn.functional.normalize(0.3 * torch.randn(count, 3, generator=generator) - origins, dim=-1)
+    return RayBundle(origins, directions, origins[:, 0], origins[:, 0], directions)
 
 
 def some_dense_samples(device, generator, rays, padding):

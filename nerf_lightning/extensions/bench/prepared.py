@@ -31,7 +31,7 @@ from nerf_lightning.training.step import TrainStep
 # Without these, torch computes everything except hash grids, random numbers and histograms.
 TWINS = (
     *("march.cpu", "ragged.cpu", "mlp.cpu", "table_adam.cpu", "render.cpu", "render.gradients"),
-    *("march.cuda", "ragged.cuda", "mlp.cuda", "table_adam.cuda", "render.cuda"),
+    *("march.cuda", "ragged.cuda", "mlp.cuda", "table_adam.cuda", "field.cuda", "render.cuda"),
 )
 
 

@@ -29,7 +29,7 @@ CPU_BACKENDS = (
 """The modules that numba compiles, slowest first."""
 CUDA_BACKENDS = (
     *("random.cuda", "march.cuda", "hash_grid.cuda", "spherical_harmonics.cuda", "mlp.cuda", "ragged.cuda"),
-    *("render.cuda", "histograms.cuda", "table_adam.cuda", "pixels.cuda", "rays.cuda"),
+    *("field.cuda", "render.cuda", "histograms.cuda", "table_adam.cuda", "pixels.cuda", "rays.cuda"),
 )
 """The modules that triton compiles."""
 FP_FUSION = "TRITON_DEFAULT_FP_FUSION"

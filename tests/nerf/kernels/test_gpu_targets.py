@@ -19,6 +19,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.field import cuda as field
 from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
 from nerf_lightning.nerf.kernels.mlp import cuda as mlp
 from nerf_lightning.nerf.kernels.mlp.op import mlp as any_mlp
@@ -32,6 +33,7 @@ SMALL = {
     "spherical_harmonics.cuda": ["_harmonics"],
     "ragged.cuda": ["_integrate", "_integrate_back", "_num_visible", "_first"],
     "render.cuda": ["_locate", "_join", "_activate", "_activate_back"],
+    "field.cuda": ["_forward", "_backward_color", "_backward_density"],
     "histograms.cuda": ["_sample", "_stratified", "_interlevel", "_distortion"],
     "table_adam.cuda": ["_update"],
     "pixels.cuda": ["_batch"],
@@ -49,30 +51,36 @@ MOST_SPILLED = 152
 
 @pytest.fixture(scope="module")
 def reachable():
-    """The widths of perceptrons, and the grids, that conf/model leads to."""
-    sizes, grids = set(), {}
+    """The widths of perceptrons, the grids, and the widths of fields on grids, that conf/model leads to."""
+    sizes, grids, fields = set(), {}, set()
     for model in options("model"):
         with torch.device("meta"):  # their sizes are enough
             built = build(composed("train", f"model={model}").model)
         for part in built.modules():
             if isinstance(part, NGPField):
-                for weights in (part.density_mlp, part.color_mlp):
-                    sizes.add((weights[0].shape[1], *(weight.shape[0] for weight in weights)))
+                both = [
+                    (weights[0].shape[1], *(weight.shape[0] for weight in weights))
+                    for weights in (part.density_mlp, part.color_mlp)
+                ]
+                sizes.update(both)
+                fields.add(tuple(both))
             if isinstance(part, HashGridEncoder):
                 grids[part.layout] = part.features_per_level
-    return sizes, grids
+    return sizes, grids, fields
 
 
 @pytest.fixture(autouse=True)
 def asked_anew():
-    mlp.takes.cache_clear()
+    for kernels in (mlp, field):
+        kernels.takes.cache_clear()
     yield
-    mlp.takes.cache_clear()
+    for kernels in (mlp, field):
+        kernels.takes.cache_clear()
 
 
 @pytest.mark.parametrize("name", FOR_ALL)
 def test_the_kernels_of_every_model_fit(name, reachable):
-    sizes, grids = reachable
+    sizes, grids, fields = reachable
     assert (32, 64, 64, 3) in sizes
     assert len(grids) >= 3
     for layout, features in grids.items():
@@ -93,6 +101,12 @@ def test_the_kernels_of_every_model_fit(name, reachable):
             mlp.backward(out, weights, kept, True, USED)
         assert len(made.kernels) == 4
         assert made.spilled() <= MOST_SPILLED, widths
+    assert ((32, 64, 16), (32, 64, 3)) in fields
+    for density, color in fields if name in BFLOAT16 else ():
+        with compiled_for(name, {field: SMALL["field.cuda"]}) as made:
+            assert field.takes(density, color, torch.device("cpu")) == (len(color) == 3)
+        assert len(made.kernels) == (3 if len(color) == 3 else 0)
+        assert not made.kernels or made.spilled() <= MOST_SPILLED, density
 
 
 @pytest.mark.parametrize("name", FOR_ALL)

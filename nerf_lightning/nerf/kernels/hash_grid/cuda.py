@@ -1,6 +1,7 @@
 """The hash grid for CUDA: a program processes a block of points on one level; the backward pass adds atomically.
 
-Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
+Everything is float32; features and their gradients may be bfloat16.
+`TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
 import functools
@@ -25,10 +26,11 @@ def forward(
     points: Float[Tensor, "points 3"],
     layout: HashGridLayout,
     used: Int[Tensor, "1"] | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "points out"]:
     """Return the features; zeros from point `used` on, rounded up to a block."""
     levels, features = len(layout.resolutions), table.shape[1]
-    out = torch.empty(points.shape[0], levels * features, device=points.device)
+    out = torch.empty(points.shape[0], levels * features, dtype=dtype, device=points.device)
     if points.shape[0]:
         grid = (triton.cdiv(points.shape[0], BLOCK), levels)
         where = (
@@ -78,7 +80,7 @@ def point_gradient(
     """Return the gradient with respect to the points, by the reference: it is rarely needed."""
     with torch.enable_grad():
         leaf = points.detach().requires_grad_()
-        interpolate_torch(table.float(), leaf, layout).backward(grad)
+        interpolate_torch(table.float(), leaf, layout).backward(grad.float())
     assert leaf.grad is not None
     return leaf.grad
 
@@ -211,7 +213,7 @@ def _backward(
         return
     x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
     at = grad + row * (levels * features) + level * features + feature
-    flowing = tl.load(at, mask=valid & (feature < features), other=0.0)
+    flowing = tl.load(at, mask=valid & (feature < features), other=0.0).to(tl.float32)
     # Most gradients are zero, from padding and from behind surfaces.
     flows = valid & (tl.max(tl.abs(flowing), axis=1, keep_dims=True) != 0.0) & (feature < features)
     for corner in tl.static_range(8):

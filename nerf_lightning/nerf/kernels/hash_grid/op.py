@@ -28,6 +28,7 @@ def interpolate(
     layout: HashGridLayout,
     cached: Float[Tensor, "points out"] | None = None,
     used: Int[Tensor, "1"] | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level; points outside are clamped to it.
 
@@ -39,12 +40,13 @@ def interpolate(
         layout: where the levels' entries are.
         cached: what this function returned for the same arguments without gradients, to avoid recomputing it.
         used: on CUDA, the index from which all points are padding: kernels skip it, and it has no gradients.
+        dtype: on CUDA, of the features.
     """
     backend = cpu_backend("hash_grid.cpu", points.device) or cuda_backend("hash_grid.cuda", points.device)
     if backend is None or table.dtype == torch.float64:
         return interpolate_torch(table, points, layout)
-    padding = (used,) if used is not None and points.is_cuda else ()
-    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, cached, padding)
+    for_cuda = (used, dtype) if points.is_cuda else ()
+    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, cached, for_cuda)
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def table_gradient(
     grad: Float[Tensor, "points out"],
     layout: HashGridLayout,
     kernels: ModuleType,
-    padding: tuple[Tensor, ...] = (),
+    padding: tuple[Tensor | None, ...] = (),
 ) -> Float[Tensor, "entries features"] | None:
     """Return a table's gradient in a backward pass; None if it is deferred, or was added in place.
 
@@ -121,13 +123,13 @@ _held = _Held()
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, cached: Any, padding: Any
+        ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, cached: Any, for_cuda: Any
     ) -> Tensor:
         ctx.save_for_backward(table, points)
-        ctx.layout, ctx.backend, ctx.padding = layout, backend, padding
+        ctx.layout, ctx.backend, ctx.padding = layout, backend, for_cuda[:1]
         if cached is not None:
             return cached.view_as(cached)
-        return backend.forward(table.detach(), points.detach(), layout, *padding)
+        return backend.forward(table.detach(), points.detach(), layout, *for_cuda)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -135,7 +137,7 @@ class _Interpolate(torch.autograd.Function):
         table, points = ctx.saved_tensors  # type: ignore[attr-defined]
         layout, backend = ctx.layout, ctx.backend  # type: ignore[attr-defined]
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
-        grad = grad.float().contiguous()
+        grad = grad.contiguous() if grad.is_cuda else grad.float().contiguous()
         padding = ctx.padding  # type: ignore[attr-defined]
         grad_table = table_gradient(table, points, grad, layout, backend, padding) if wants_table else None
         grad_points = backend.point_gradient(table.detach(), points, grad, layout) if wants_points else None

@@ -86,7 +86,7 @@ def backward(
     """Return the gradients of the inputs and of the weights; `saved` is what `forward` returned for the same `used`."""
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
-    programs = max(1, min(PROGRAMS * _multiprocessors(grad.device), triton.cdiv(rows, BACKWARD_BLOCK)))
+    programs = max(1, min(PROGRAMS * multiprocessors(grad.device), triton.cdiv(rows, BACKWARD_BLOCK)))
     sums = of_points.new_empty(programs, sum(a * b for a, b in pairwise(widths)))
     if not rows:
         sums.zero_()
@@ -121,7 +121,8 @@ def trial(device: str = "cuda") -> None:
 
 
 @functools.cache
-def _multiprocessors(device: torch.device) -> int:
+def multiprocessors(device: torch.device) -> int:
+    """Return how many multiprocessors a device has."""
     there = device.type == "cuda" and torch.cuda.is_available()
     return torch.cuda.get_device_properties(device).multi_processor_count if there else ELSEWHERE
 
@@ -145,7 +146,8 @@ def _sizes(weights: Sequence[Tensor], widths: Sequence[int]) -> tuple[int, ...]:
 
 @triton.jit
 @no_type_check
-def _multiply(left, right, widen: tl.constexpr):
+def multiply(left, right, widen: tl.constexpr):
+    """Return a product, in float32; widened: of float32 numbers."""
     if widen:
         left, right = left.to(tl.float32), right.to(tl.float32)
     return tl.dot(left, right)
@@ -153,7 +155,7 @@ def _multiply(left, right, widen: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _weights(weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr):
+def layer_weights(weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr):
     """Return a layer's weights in bfloat16, with zeros around them."""
     row, column = tl.arange(0, outer)[:, None], tl.arange(0, inner)[None, :]
     there = (row < n_out) & (column < n_in)
@@ -162,7 +164,7 @@ def _weights(weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexp
 
 @triton.jit
 @no_type_check
-def _rows(array, row, count, width: tl.constexpr, padded: tl.constexpr):
+def rows_of(array, row, count, width: tl.constexpr, padded: tl.constexpr):
     """Return some rows of `width` numbers as bfloat16, zero-padded on the right and below."""
     column = tl.arange(0, padded)
     there = (row < count)[:, None] & (column < width)[None, :]
@@ -177,10 +179,11 @@ def _saved_at(saved, row, words: tl.constexpr, first: tl.constexpr, width: tl.co
 
 @triton.jit
 @no_type_check
-def _activated(
+def activated(
     x, weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr
 ):
-    sums = _multiply(x, tl.trans(_weights(weight, n_in, n_out, inner, outer)), widen)
+    """Return a hidden layer, in bfloat16."""
+    sums = multiply(x, tl.trans(layer_weights(weight, n_in, n_out, inner, outer)), widen)
     return tl.maximum(sums, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.bfloat16)
 
 
@@ -201,37 +204,38 @@ def _forward(
         nothing = tl.zeros([block, width], tl.float32)
         tl.store(out + row[:, None] * n3 + column, nothing, mask=valid & (column < n3))
         return
-    x = _rows(points, row, count, n0, d0)
-    y = _activated(x, w0, n0, n1, d0, d1, widen)
+    x = rows_of(points, row, count, n0, d0)
+    y = activated(x, w0, n0, n1, d0, d1, widen)
     if keep:
         tl.store(_saved_at(saved, row, words, 0, d0), x, mask=valid)
         tl.store(_saved_at(saved, row, words, d0, d1), y, mask=valid)
     if layers == 3:
-        z = _activated(y, w1, n1, n2, d1, d2, widen)
+        z = activated(y, w1, n1, n2, d1, d2, widen)
         if keep:
             tl.store(_saved_at(saved, row, words, d0 + d1, d2), z, mask=valid)
-        sums = _multiply(z, tl.trans(_weights(w2, n2, n3, d2, d3)), widen)
+        sums = multiply(z, tl.trans(layer_weights(w2, n2, n3, d2, d3)), widen)
         column = tl.arange(0, d3)
     else:
-        sums = _multiply(y, tl.trans(_weights(w1, n1, n2, d1, d2)), widen)
+        sums = multiply(y, tl.trans(layer_weights(w1, n1, n2, d1, d2)), widen)
         column = tl.arange(0, d2)
     tl.store(out + row[:, None] * n3 + column[None, :], sums, mask=valid & (column < n3)[None, :])
 
 
 @triton.jit
 @no_type_check
-def _passed_back(
+def passed_back(
     flowing, x, weight, n_in: tl.constexpr, n_out: tl.constexpr, inner: tl.constexpr, outer: tl.constexpr,
     widen: tl.constexpr,
 ):  # fmt: skip
     """Return the gradient of a layer's inputs x, before their ReLU."""
-    sums = _multiply(flowing, _weights(weight, n_in, n_out, inner, outer), widen)
+    sums = multiply(flowing, layer_weights(weight, n_in, n_out, inner, outer), widen)
     return tl.where(x.to(tl.float32) > 0.0, sums, 0.0).to(tl.bfloat16)
 
 
 @triton.jit
 @no_type_check
-def _store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer: tl.constexpr):
+def store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer: tl.constexpr):
+    """Store the gradient of a weight."""
     tl.store(sums + first + tl.arange(0, outer)[:, None] * inner + tl.arange(0, inner)[None, :], of_weight)
 
 
@@ -251,22 +255,22 @@ def _backward(
         row = (start + tl.arange(0, block)).to(tl.int64)
         valid = (row < count)[:, None]
         if layers == 3:
-            flowing = _rows(grad, row, count, n3, d3)
+            flowing = rows_of(grad, row, count, n3, d3)
             z = tl.load(_saved_at(saved, row, words, d0 + d1, d2), mask=valid, other=0.0)
-            of_2 += _multiply(tl.trans(flowing), z, widen)
-            flowing = _passed_back(flowing, z, w2, n2, n3, d2, d3, widen)
+            of_2 += multiply(tl.trans(flowing), z, widen)
+            flowing = passed_back(flowing, z, w2, n2, n3, d2, d3, widen)
         else:
-            flowing = _rows(grad, row, count, n3, d2)
+            flowing = rows_of(grad, row, count, n3, d2)
         y = tl.load(_saved_at(saved, row, words, d0, d1), mask=valid, other=0.0)
-        of_1 += _multiply(tl.trans(flowing), y, widen)
-        flowing = _passed_back(flowing, y, w1, n1, n2, d1, d2, widen)
+        of_1 += multiply(tl.trans(flowing), y, widen)
+        flowing = passed_back(flowing, y, w1, n1, n2, d1, d2, widen)
         x = tl.load(_saved_at(saved, row, words, 0, d0), mask=valid, other=0.0)
-        of_0 += _multiply(tl.trans(flowing), x, widen)
+        of_0 += multiply(tl.trans(flowing), x, widen)
         if wants_points:
             column = tl.arange(0, d0)
             there = valid & (column < n0)[None, :]
             into = of_points + row[:, None] * n0 + column[None, :]
-            tl.store(into, _multiply(flowing, _weights(w0, n0, n1, d0, d1), widen), mask=there)
+            tl.store(into, multiply(flowing, layer_weights(w0, n0, n1, d0, d1), widen), mask=there)
     if used is not None and wants_points:
         # The gradient of padding.
         column = tl.arange(0, d0)[None, :]
@@ -276,7 +280,7 @@ def _backward(
             nothing = tl.zeros([block, d0], tl.float32)
             tl.store(of_points + row * n0 + column, nothing, mask=(row < count) & (column < n0))
     own = sums + tl.program_id(0) * (d0 * d1 + d1 * d2 + (d2 * d3 if layers == 3 else 0))
-    _store_sum(own, 0, of_0, d0, d1)
-    _store_sum(own, d0 * d1, of_1, d1, d2)
+    store_sum(own, 0, of_0, d0, d1)
+    store_sum(own, d0 * d1, of_1, d1, d2)
     if layers == 3:
-        _store_sum(own, d0 * d1 + d1 * d2, of_2, d2, d3)
+        store_sum(own, d0 * d1 + d1 * d2, of_2, d2, d3)

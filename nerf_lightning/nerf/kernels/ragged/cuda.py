@@ -91,7 +91,7 @@ def first_of_each_ray(
     rays, width = counts.shape[0], 0 if features is None else features.shape[1]
     index, bounds = counts.new_empty(capacity), torch.empty_like(samples.bounds)
     starts, ends = samples.starts.new_empty(capacity), samples.ends.new_empty(capacity)
-    left = starts.new_empty(capacity, width)
+    left = (starts if features is None else features).new_empty(capacity, width)
     found = torch.empty_like(samples.found)
     given = samples.starts, samples.ends, samples.bounds, samples.found, counts.cumsum(0)
     arrays = *given, starts if features is None else features.contiguous(), index, starts, ends, bounds, found, left

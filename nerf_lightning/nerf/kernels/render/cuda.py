@@ -16,6 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.field.cuda import color_slope, inside, midpoint
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.mlp.op import mlp
@@ -49,13 +51,7 @@ def render(
     """
     where = _Where(rays, samples)
     points = _points(rays, where, field)
-    features = interpolate(field.table, points, field.layout, features, where.used)
-    hidden = mlp(features, field.density_weights, matmul_precision, where.used)
-    raw = hidden.new_empty(0, 3)
-    if field.color_weights:
-        joined = _Joined.apply(hidden, field.ray_features(rays), where)
-        raw = mlp(joined, field.color_weights, matmul_precision, where.used)
-    density, rgb = _Activated.apply(hidden, raw, points, where, field, whole_from)
+    density, rgb = _density_and_color(rays, where, points, field, matmul_precision, whole_from, features)[:2]
     if isinstance(samples, RaggedSamples):
         return integrate(density, rgb, samples)
     shape = rays.near.shape[0], where.each
@@ -68,13 +64,66 @@ def density(
     rays: RayBundle, samples: RaggedSamples, field: FieldParts, matmul_precision: MatmulPrecision
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]]:
     """Return the density and the features of the hash grid at samples, without gradients."""
-    where = _Where(rays, samples)
-    points = _points(rays, where, field)
+    where, plain = _Where(rays, samples), replace(field, color_weights=[])
     with torch.no_grad():
-        features = interpolate(field.table, points, field.layout, used=where.used)
-        hidden = mlp(features, field.density_weights, matmul_precision, where.used)
-        none = hidden.new_empty(0, 3)
-        return _Activated.apply(hidden, none, points, where, replace(field, color_weights=[]), 0.0)[0], features
+        points = _points(rays, where, field)
+        found, _, features = _density_and_color(rays, where, points, plain, matmul_precision, 0.0, None)
+    return found, features
+
+
+def _density_and_color(
+    rays: RayBundle,
+    where: "_Where",
+    points: Tensor,
+    field: FieldParts,
+    matmul_precision: MatmulPrecision,
+    whole_from: float,
+    features: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return density, color and the features of the hash grid."""
+    fused = _fused(field, rays, matmul_precision)
+    dtype = torch.float32 if fused is None else torch.bfloat16
+    features = interpolate(field.table, points, field.layout, features, where.used, dtype)
+    shared = field.ray_features(rays) if field.color_weights else points.new_empty(1, 0)
+    if fused is not None:
+        how = fused.Activations(field.bias, field.least_slope, whole_from, not field.contracted)
+        samples = fused.Samples(*where.arrays, points, where.each, where.used)
+        weights = len(field.density_weights), *field.density_weights, *field.color_weights
+        return *_Fused.apply(features, fused, shared, samples, how, *weights), features
+    hidden = mlp(features, field.density_weights, matmul_precision, where.used)
+    raw = hidden.new_empty(0, 3)
+    if field.color_weights:
+        raw = mlp(_Joined.apply(hidden, shared, where), field.color_weights, matmul_precision, where.used)
+    return *_Activated.apply(hidden, raw, points, where, field, whole_from), features
+
+
+def _fused(field: FieldParts, rays: RayBundle, matmul_precision: MatmulPrecision) -> Any:
+    """Return the kernels that take both MLPs in one pass; None if they do not take these."""
+    kernels: Any = cuda_backend("field.cuda", rays.near.device) if matmul_precision == "bfloat16" else None
+    widths = ((each[0].shape[1], *(layer.shape[0] for layer in each)) if each else () for each in field.weights)
+    return kernels if kernels is not None and kernels.takes(*widths, rays.near.device) else None
+
+
+class _Fused(torch.autograd.Function):
+    """Density and color from the features of the hash grid."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, kernels: Any, shared: Tensor, samples: Any, how: Any, layers: int, *weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        mlps = [each.detach() for each in weights[:layers]], [each.detach() for each in weights[layers:]]
+        ctx.kernels, ctx.given = kernels, (shared.detach(), samples, *mlps, how)
+        keep = any(ctx.needs_input_grad)
+        density, rgb, hidden = kernels.forward(features.detach(), *ctx.given, keep)
+        ctx.save_for_backward(features, hidden)
+        return density, rgb
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
+        features, hidden = ctx.saved_tensors
+        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, hidden, features, *ctx.given)
+        return of_features, None, None, None, None, None, *of_weights
 
 
 def trial(device: str = "cuda") -> None:
@@ -181,20 +230,6 @@ class _Activated(torch.autograd.Function):
 
 @triton.jit
 @no_type_check
-def _midpoint(ray_index, starts, ends, sample, valid, each: tl.constexpr):
-    """Return the rays and midpoints of some samples."""
-    if each > 0:
-        ray = sample // each
-        shift = ray
-    else:
-        ray = tl.load(ray_index + sample, mask=valid, other=0)
-        shift = ray * 0
-    begin = tl.load(starts + sample + shift, mask=valid, other=0.0)
-    return ray, 0.5 * (begin + tl.load(ends + sample + shift, mask=valid, other=0.0))
-
-
-@triton.jit
-@no_type_check
 def _coordinate(origins, directions, aabb, ray, t, valid, axis: tl.constexpr):
     """Return one coordinate of points on rays, as shares of the box's side."""
     low, high = tl.load(aabb + axis), tl.load(aabb + 3 + axis)
@@ -210,7 +245,7 @@ def _locate(
 ):  # fmt: skip
     sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
     valid = sample < count
-    ray, t = _midpoint(ray_index, starts, ends, sample, valid, each)
+    ray, t = midpoint(ray_index, starts, ends, sample, valid, each)
     x = _coordinate(origins, directions, aabb, ray, t, valid, 0)
     y = _coordinate(origins, directions, aabb, ray, t, valid, 1)
     z = _coordinate(origins, directions, aabb, ray, t, valid, 2)
@@ -244,17 +279,6 @@ def _join(
 
 @triton.jit
 @no_type_check
-def _inside(points, sample, valid):
-    """Return whether points are in the unit cube."""
-    x = tl.load(points + 3 * sample, mask=valid, other=0.0)
-    y = tl.load(points + 3 * sample + 1, mask=valid, other=0.0)
-    z = tl.load(points + 3 * sample + 2, mask=valid, other=0.0)
-    nearest = tl.minimum(tl.minimum(x, y), z)
-    return (nearest >= 0.0) & (tl.maximum(tl.maximum(x, y), z) <= 1.0)
-
-
-@triton.jit
-@no_type_check
 def _activate(
     hidden, raw, points, density, rgb, bias, largest, count,
     width: tl.constexpr, boxed: tl.constexpr, colored: tl.constexpr, block: tl.constexpr,
@@ -264,7 +288,7 @@ def _activate(
     sigma = tl.load(hidden + sample * width, mask=valid, other=0.0) + bias
     sigma = tl.exp(tl.minimum(sigma, largest, propagate_nan=tl.PropagateNan.ALL))
     if boxed:
-        sigma = tl.where(_inside(points, sample, valid), sigma, 0.0)
+        sigma = tl.where(inside(points, sample, valid), sigma, 0.0)
     tl.store(density + sample, sigma, mask=valid)
     for channel in tl.static_range(3):
         value = tl.zeros([block], tl.float32)
@@ -293,7 +317,7 @@ def _activate_back(
     slope = tl.exp(tl.minimum(tl.maximum(x, -largest), largest))
     grad = tl.load(of_density + sample, mask=valid, other=0.0) * share * slope
     if boxed:
-        grad = tl.where(_inside(points, sample, valid), grad, 0.0)
+        grad = tl.where(inside(points, sample, valid), grad, 0.0)
     # The density is the first of the hidden features; a program writes contiguous rows.
     column = tl.arange(0, columns)[None, :]
     at = of_hidden + sample[:, None] * width + column
@@ -302,7 +326,5 @@ def _activate_back(
         for channel in tl.static_range(3):
             color = tl.load(rgb + 3 * sample + channel, mask=valid, other=0.0)
             grad = tl.load(of_rgb + 3 * sample + channel, mask=valid, other=0.0) * share
-            slope = color * (1.0 - color)
-            # A step goes against the gradient: back from black or full.
-            slope = tl.where(grad * (color - 0.5) > 0.0, tl.maximum(slope, least_slope), slope)
+            slope = color_slope(color, grad, least_slope)
             tl.store(of_raw + 3 * sample + channel, grad * slope, mask=valid)

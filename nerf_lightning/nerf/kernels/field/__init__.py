@@ -1,0 +1,1 @@
+"""Features of a hash grid to density and color."""
