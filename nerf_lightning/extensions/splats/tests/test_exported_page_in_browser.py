@@ -134,6 +134,11 @@ def test_a_scene_without_bounds_is_shown_as_the_rasterizer_draws_it(tmp_path):
         assert psnr(found, drawn(page, read_page(page)[0]["first"], width, height, 0.0)) > 38
         assert found.std() > 0.1
         assert found.min(axis=2).mean() > 0.05  # the wall is there
+        framed = "return document.body.classList.contains('framed')"  # dark outside of the photograph's frame
+        assert driver.execute_script(framed)
+        drag(driver, 10, 0)
+        wait_for(driver, "still")
+        assert not driver.execute_script(framed)
         assert driver.get_log("browser") == []
 
 
