@@ -29,7 +29,7 @@ from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.world_frame import central_view, gaps_around
 from nerf_lightning.nerf.rendering.background import at_evaluation, photograph
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
-from nerf_lightning.visualization.pictures import to_bytes
+from nerf_lightning.visualization.pictures import color_map, to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
@@ -39,6 +39,7 @@ INSIDE = 0.01  # Share of the splats beyond either side of the box around which 
 BACKGROUND_COLORS: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 STILL, PHOTOGRAPH = 640, 320  # Longer side in pixels of the still picture, and of photographs.
 JPEG_QUALITY = 80
+DEPTH_COLORS = 17  # Straight lines between these follow the report's scale.
 PART_OF_PANORAMA = 1.5  # Field of view around a panorama's direction, in radians.
 # With a wider gap, cameras do not surround the scene: the page then sways, at most this far to either side.
 WIDEST_GAP, MOST_SWAY = 120.0, 20.0  # Degrees.
@@ -83,6 +84,7 @@ def write_page(
         "bytes": len(packed),
         "focal": focal,
         "dilation": DILATION,
+        "depth_colors": color_map(torch.linspace(0, 1, DEPTH_COLORS)[None], 0.0, 1.0)[0].tolist(),
         "near": _nearest(record),
         "unbounded": record.space == "contracted",
         "cameras": [_camera(record.cameras, view) for view in views],

@@ -86,6 +86,9 @@ def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
             controls = driver.find_element("css selector", "#numbers").text
             assert ("two fingers" in controls, "Shift and drag" in controls) == (size == "phone", size != "phone")
             assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
+            controls = "[...document.querySelectorAll('button, select, summary, label')]"
+            heights = driver.execute_script(f"return {controls}.map(each => each.getBoundingClientRect().height)")
+            assert min(filter(None, heights)) >= (40 if size == "phone" else 24)
             before = "document.getElementById('full').getBoundingClientRect()"
             left = driver.execute_script(f"return {before}.left")
             driver.execute_script("document.getElementById('tools').open = false")
