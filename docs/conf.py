@@ -49,16 +49,21 @@ site_pages.write()
 
 
 BOLD = re.compile(r'<mi mathvariant="bold">([A-Za-z])</mi>')
+BRACKET = re.compile('<mo stretchy="[^>]*>')
 
 
 def mathml(formula, display="inline"):
-    """Return a formula as MathML; browsers know bold letters only as letters of their own (U+1D400 and so on)."""
+    """Return a formula as MathML; browsers know bold letters only as letters of their own (U+1D400 and so on).
+
+    Brackets keep their size, and bars stand at what they enclose: without a font for mathematics, stretched ones sink.
+    """
 
     def bold(letter):
         first, offset = (0x1D400, ord("A")) if letter[1].isupper() else (0x1D41A, ord("a"))
         return f"<mi>{chr(first + ord(letter[1]) - offset)}</mi>"
 
-    return BOLD.sub(bold, convert(formula, display=display))
+    converted = BRACKET.sub('<mo stretchy="false" lspace="0" rspace="0">', convert(formula, display=display))
+    return BOLD.sub(bold, converted)
 
 
 def inline_math(page, node):

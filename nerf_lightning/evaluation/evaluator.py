@@ -28,7 +28,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.rendering.background import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
-from nerf_lightning.visualization.pictures import visible_range
+from nerf_lightning.visualization.pictures import joint_range
 
 # Number of views that the range of the depth's colors is taken from, and the maximum length of their longer side.
 PROBES, PROBE_PIXELS = 8, 32
@@ -172,9 +172,9 @@ def _depth_range(
 ) -> tuple[float, float]:
     """Return near and far of what a few small views show, in meters or the user's units."""
     small, few = rays_of.at_most(PROBE_PIXELS), evenly_spaced_subset(views, PROBES)
-    pictures = [render_picture(model, small, view, background, tile_points) for view in few]
-    depth, opacity = (torch.cat([getattr(each, name).flatten() for each in pictures]) for name in ("depth", "opacity"))
-    return visible_range(told_length(scene)[0] * depth[None], opacity[None])
+    unit = told_length(scene)[0]
+    pictures = (render_picture(model, small, view, background, tile_points) for view in few)
+    return joint_range((unit * picture.depth, picture.opacity) for picture in pictures)
 
 
 def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:

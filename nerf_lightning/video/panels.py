@@ -83,7 +83,8 @@ def film_pictures(
 
     if mosaic:
         named = zip(panels, [f"{label} | " if several else "" for label in labels], strict=True)
-        rows = [row((each[name], prefix + name) for name in each) for each, prefix in named]
+        titles = {name: "color" if name == "rgb" else name for name in panels[0]}
+        rows = [row((each[name], prefix + title) for name, title in titles.items()) for each, prefix in named]
         width = max(each.shape[1] for each in rows)
         below = [pad(each, (0, 0, 0, width - each.shape[1], 0, size), value=PAPER) for each in rows]
         return {"mosaic": framed(torch.cat(below)[:-size], size)}

@@ -30,6 +30,7 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, Content, PathFrame, frame_of
 from nerf_lightning.video.paths.sweep import MIDDLE
 from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.visualization.pictures import joint_range
 
 # Number of frames that the range of the depth's colors is taken from, and the maximum length of their longer side.
 PROBES, PROBE_PIXELS = 12, 64
@@ -171,21 +172,9 @@ def _in_middle(cameras: Cameras, view: int, points: Float[Tensor, "points 3"]) -
 
 
 def depth_range(shots: list[Shot]) -> tuple[float, float]:
-    """Return near and far of what is seen on the whole path, in the shots' units, from a few small frames.
-
-    The outer 1 % at each end are left out. If nothing is seen, they are the scene's own.
-    """
-    seen = []
-    for shot in map(Shot.small, shots):
-        for frame in range(len(shot.cameras.c2w)):
-            picture = shot.picture(frame)
-            seen.append(shot.unit * picture.depth[picture.opacity > 0.5])
-    depths = torch.cat(seen)
-    if not depths.numel():
-        scene = shots[0].subject.scene
-        return shots[0].unit * float(scene.near.min()), shots[0].unit * float(scene.far.max())
-    near, far = torch.quantile(depths, torch.tensor([0.01, 0.99])).tolist()
-    return near, far
+    """Return near and far of what is seen on the whole path, in the shots' units, from a few small frames."""
+    seen = ((shot.unit, shot.picture(frame)) for shot in map(Shot.small, shots) for frame in range(len(shot.near)))
+    return joint_range((unit * picture.depth, picture.opacity) for unit, picture in seen)
 
 
 def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:

@@ -99,6 +99,12 @@ def visible_range(depth: Float[Tensor, "height width"], opacity: Float[Tensor, "
     return float(near), float(far)
 
 
+def joint_range(pictures: Iterable[tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels"]]]) -> tuple[float, float]:
+    """Return near and far of what is visible in several pictures, given the depth and opacity of each."""
+    depth, opacity = (torch.cat([each.flatten() for each in parts]) for parts in zip(*pictures, strict=True))
+    return visible_range(depth[None], opacity[None])
+
+
 def depth_picture(
     depth: Float[Tensor, "height width"],
     near: float,
@@ -214,6 +220,7 @@ def _with_scale(picture: UInt8[Tensor, "height width 3"], top: str, bottom: str)
     ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
     page.paste(Image.fromarray(to_bytes(ramp).numpy()), (space, 0))
     draw, left = ImageDraw.Draw(page), 2 * space + thick
-    draw.text((left, 0), top, fill=_INK, font=font, anchor="lt")
-    draw.text((left, height), bottom, fill=_INK, font=font, anchor="ls")
+    # Round digits reach beyond their lines.
+    draw.text((left, 1), top, fill=_INK, font=font, anchor="lt")
+    draw.text((left, height - 2), bottom, fill=_INK, font=font, anchor="ls")
     return torch.cat([picture, torch.from_numpy(np.array(page))], dim=1)

@@ -13,6 +13,7 @@ from nerf_lightning.visualization.pictures import (
     color_map,
     depth_picture,
     error_picture,
+    joint_range,
     mosaic,
     panels,
     save_png,
@@ -85,6 +86,7 @@ def test_visible_range_ignores_what_light_passes_through():
     assert 2.2 <= near < 2.3
     assert 3.7 < far <= 3.8
     assert visible_range(depth, torch.zeros(10, 10))[1] > 50
+    assert joint_range([(depth[:5], opacity[:5]), (depth[5:], opacity[5:])]) == (near, far)
 
 
 @pytest.mark.parametrize("size", [24, 301])

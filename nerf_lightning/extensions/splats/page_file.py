@@ -26,10 +26,10 @@ from nerf_lightning.extensions.splats.views import color_behind, without_lens
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, json_in_page, own_policy, rendered
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.geometry.world_frame import gaps_around
+from nerf_lightning.nerf.geometry.world_frame import central_view, gaps_around
 from nerf_lightning.nerf.rendering.background import at_evaluation, photograph
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
-from nerf_lightning.visualization.pictures import to_bytes
+from nerf_lightning.visualization.pictures import color_map, to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "splats.js", "path.js", "marks.js")
@@ -39,6 +39,7 @@ INSIDE = 0.01  # Share of the splats beyond either side of the box around which 
 BACKGROUND_COLORS: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 STILL, PHOTOGRAPH = 640, 320  # Longer side in pixels of the still picture, and of photographs.
 JPEG_QUALITY = 80
+DEPTH_COLORS = 17  # Straight lines between these follow the report's scale.
 PART_OF_PANORAMA = 1.5  # Field of view around a panorama's direction, in radians.
 # With a wider gap, cameras do not surround the scene: the page then sways, at most this far to either side.
 WIDEST_GAP, MOST_SWAY = 120.0, 20.0  # Degrees.
@@ -68,22 +69,22 @@ def write_page(
     """Write the page of splats, with facts about them, and one to `max_photographs` places to jump to.
 
     `focal` is that of the pictures that they were fitted to, in pixels. The view of `marks`, or the photograph, named
-    `first_view` is shown first; None: the training view nearest to their average.
+    `first_view` is shown first; None: the most central training view.
     """
     packed, shown = splats.packed(), splats.gaussians()
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
     names = [view["name"] for view in marks["views"]]
-    if first_view in record.view_names and first_view not in names:
-        views = sorted({*views[1:], record.view_names.index(first_view)})
-        first = record.view_names.index(first_view)
-    else:
-        first = average_view(record, views)
+    is_photograph = first_view in record.view_names and first_view not in names
+    first = record.view_names.index(first_view) if is_photograph else central_view(record)
+    if first not in views:
+        views = sorted([*views[1:], first])
     middle, radius = _middle(shown, record, run.crop is not None)
     up = functional.normalize(record.cameras.c2w[:, :, 1].mean(dim=0), dim=0)
     about = splats.described() | {
         "bytes": len(packed),
         "focal": focal,
         "dilation": DILATION,
+        "depth_colors": color_map(torch.linspace(0, 1, DEPTH_COLORS)[None], 0.0, 1.0)[0].tolist(),
         "near": _nearest(record),
         "unbounded": record.space == "contracted",
         "cameras": [_camera(record.cameras, view) for view in views],
@@ -124,20 +125,6 @@ def write_page(
     )
     with whole_file(target) as part:
         part.write_text(text, encoding="utf-8")
-
-
-def average_view(record: SceneRecord, views: Sequence[int]) -> int:
-    """Return the view, a training view if any, whose camera is nearest to the training cameras' mean.
-
-    The model knows most about what is there, and it is oriented like most photographs.
-    """
-    train = set(record.splits["train"])
-    candidates = [view for view in views if view in train] or list(views)
-    known = record.cameras.c2w[sorted(train)]
-    spread = known[:, :, 3].std(dim=0, correction=0).norm().clamp(min=1e-6)
-    apart = record.cameras.c2w[candidates] - known.mean(dim=0)
-    apart[:, :, 3] /= spread
-    return candidates[int(apart.flatten(1).norm(dim=1).argmin())]
 
 
 def sway(record: SceneRecord, middle: Sequence[float], up: Float[Tensor, "3"]) -> float | None:

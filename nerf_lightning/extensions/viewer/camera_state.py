@@ -13,6 +13,7 @@ from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.near_far_of_new_views import near_and_far_from
 from nerf_lightning.nerf.geometry.poses import flip_yz, quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
+from nerf_lightning.video.paths.base import PathFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,12 @@ def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Ten
 def quaternion_of(c2w: Tensor) -> np.ndarray:
     """Return the rotation of a pose in viser's form: w, x, y, z for the axes right, down, forward."""
     return quaternion_from_rotation(flip_yz(c2w)[:, :3].double()).numpy()
+
+
+def point_ahead(c2w: Float[Tensor, "3 4"], around: PathFrame) -> Float[Tensor, "3"]:
+    """Return what a user at a photograph's camera turns around: on its axis, about as far away as the center."""
+    ahead = max(float((c2w[:, 3] - around.center) @ c2w[:, 2]), 0.1 * around.radius)
+    return c2w[:, 3] - ahead * c2w[:, 2]
 
 
 def camera_of(state: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:

@@ -8,7 +8,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.extensions.viewer.camera_state import CameraState, fov_that_holds, pose_of, quaternion_of
+from nerf_lightning.extensions.viewer.camera_state import (
+    CameraState,
+    fov_that_holds,
+    point_ahead,
+    pose_of,
+    quaternion_of,
+)
 from nerf_lightning.extensions.viewer.channels import COLOR, FARTHEST, in_window, picture_of, planar_depth, wiped
 from nerf_lightning.extensions.viewer.progressive import ProgressiveRendering
 from nerf_lightning.extensions.viewer.render_queue import RenderQueue
@@ -95,10 +101,9 @@ class ViewerClient:
         """Look through the camera of a photograph."""
         c2w = self.photographs.record.cameras.c2w[view]
         self.photograph, self._arrived = view, False
-        ahead = max(float((c2w[:, 3] - self.around.center) @ c2w[:, 2]), 0.1 * self.around.radius)
         with self.client.atomic():
             self.client.camera.position = c2w[:, 3].double().numpy()
-            self.client.camera.look_at = (c2w[:, 3] - ahead * c2w[:, 2]).double().numpy()
+            self.client.camera.look_at = point_ahead(c2w, self.around).double().numpy()
         self.request_view()
 
     def leave(self) -> None:

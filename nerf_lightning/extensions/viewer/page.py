@@ -7,7 +7,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.extensions.viewer.camera_state import fov_that_holds
+from nerf_lightning.extensions.viewer.camera_state import fov_that_holds, point_ahead
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.extensions.viewer.controls import MOST_DEGREES, Controls
 from nerf_lightning.extensions.viewer.guarded_server import Auth, guarded_server
@@ -17,12 +17,10 @@ from nerf_lightning.extensions.viewer.shown_photographs import Photographs
 from nerf_lightning.extensions.viewer.training_switch import TrainingSwitch
 from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
+from nerf_lightning.nerf.geometry.world_frame import central_view
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.runs.results import scene_of_run
 from nerf_lightning.video.paths.base import frame_of
-
-# The initial view is this many times as far from the center as the first photograph: behind the cameras.
-START = 1.4
 
 
 def require_viser() -> Any:
@@ -61,6 +59,7 @@ class Page:
         self.queue, self.photographs, self.folder, self.auth = queue, photographs, folder, auth
         self.most_height, self.training, self.exports = most_height, training, exports
         record = photographs.record
+        self.first = central_view(record)
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages may be closed while a picture is being sent; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
@@ -92,12 +91,9 @@ class Page:
         self.server.gui.configure_theme(show_share_button=False, show_logo=False)
         self.server.scene.set_up_direction(tuple(self.around.up.tolist()))
         start = self.server.initial_camera
-        first, center = record.cameras.c2w[0, :, 3], self.around.center
-        # Forward-facing captures show nothing from behind the cameras of their near plane.
-        farther = START if record.space == "bounded" else 1.0
-        start.position = tuple((center + farther * (first - center)).tolist())
-        start.look_at = tuple(center.tolist())
-        start.fov = vertical_field_of_view(record.cameras, 0)
+        c2w = record.cameras.c2w[self.first]
+        start.position, start.look_at = tuple(c2w[:, 3].tolist()), tuple(point_ahead(c2w, self.around).tolist())
+        start.fov = vertical_field_of_view(record.cameras, self.first)
         start.near, start.far = 0.01 * self.around.radius, 100 * self.around.radius
 
     def _welcome(self, client: Any) -> None:
@@ -112,12 +108,12 @@ class Page:
             self.queue.remove(client.client_id)
 
     def _first_fov(self, window: float) -> float:
-        """Return the initial field of view: that of the first photograph, in a window of any shape."""
+        """Return the initial field of view: that of the photograph it starts at, in any window."""
         cameras = self.photographs.record.cameras
         panorama = cameras.lens_model == "equirectangular"
-        shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])
+        shape = 1.0 if panorama else int(cameras.width[self.first]) / int(cameras.height[self.first])
         widest = math.radians(MOST_DEGREES)
-        return min(fov_that_holds(vertical_field_of_view(cameras, 0), shape, window), widest)
+        return min(fov_that_holds(vertical_field_of_view(cameras, self.first), shape, window), widest)
 
 
 def _title(name: str, run: Path) -> str:

@@ -202,3 +202,16 @@ def directions_seen(scene: SceneRecord) -> tuple[Float[Tensor, "views"], Float[T
     """Return azimuth (from x toward y) and elevation in degrees of each camera, as seen from the middle."""
     x, y, z = (scene.cameras.c2w[:, :, 3] - middle_of(scene)).unbind(dim=-1)
     return torch.atan2(y, x).rad2deg(), torch.atan2(z, (x.square() + y.square()).sqrt()).rad2deg()
+
+
+def central_view(scene: SceneRecord) -> int:
+    """Return the training view whose camera is nearest to the training cameras' mean, in place and direction.
+
+    Pages start there: the model knows most about what is there, and it is oriented like most photographs.
+    """
+    train = list(scene.splits["train"])
+    c2w = scene.cameras.c2w[train]
+    spread = c2w[:, :, 3].std(dim=0, correction=0).norm().clamp(min=1e-6)
+    apart = c2w - c2w.mean(dim=0)
+    apart[:, :, 3] /= spread
+    return train[int(apart.flatten(1).norm(dim=1).argmin())]

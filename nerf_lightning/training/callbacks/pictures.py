@@ -49,6 +49,7 @@ class ValidationPictures(Watcher):
         scene = trainer.datamodule.scene
         whole = photograph(scene, view, scene.background).movedim(-1, 0)
         truth = functional.interpolate(whole[None], picture.rgb.shape[:2], mode="area")[0].movedim(0, -1)
+        # The depth's range is this picture's own: nobody knows yet what the trained field will show.
         panel = mosaic(panels(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity))
         for name, shown in (("validation", panel), ("progress", to_bytes(picture.rgb))):
             folder = make_folder(Path(trainer.default_root_dir), "images", name)

@@ -1,7 +1,8 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
 const MIDDLE = matchMedia("(pointer: coarse)").matches ? "" : ", or press Enter for the middle";
-const NARROW = matchMedia("(max-width: 600px)"), TOLD = 6000;  // milliseconds that a result stays
+const NARROW = matchMedia("(max-width: 700px)"), TOLD = 6000;  // milliseconds that a result stays
+const GAP = 4;  // pixels between labels
 const ASKS = {
   note: `Tap the place that the note is about${MIDDLE}.`,
   distance: `Tap the first point${MIDDLE}.`,
@@ -28,7 +29,7 @@ class Marks {
   addView() {
     const picture = document.querySelector("#photographs button[aria-pressed=true]");
     const name = prompt("Name of this view", picture === null ? `view ${this.lists.views.length + 1}` : picture.title);
-    if (name) this.add("views", { name, ...this.path.cameraOf(this.frames.view) });
+    if (name) this.add("views", { name: this.unique("views", "name", name), ...this.path.cameraOf(this.frames.view) });
   }
 
   show(view) {
@@ -60,7 +61,7 @@ class Marks {
     if (this.asks === "note") {
       this.begin(null);
       const text = prompt("Note");
-      if (text) this.add("notes", { text, position: point });
+      if (text) this.add("notes", { text: this.unique("notes", "text", text), position: point });
     } else if (this.asks === "distance") {
       this.first = point;
       this.begin("second");
@@ -75,6 +76,14 @@ class Marks {
 
   // A result stays until the next action; what is asked for, until it is done.
   forget() { if (this.asks === null) byId("told").textContent = ""; }
+
+  // A name that no other mark of its kind has.
+  unique(kind, key, name) {
+    const taken = this.lists[kind].map((mark) => mark[key]), named = (count) => (count === 1 ? name : `${name} (${count})`);
+    let count = 1;
+    while (taken.includes(named(count))) count++;
+    return named(count);
+  }
 
   add(kind, mark) {
     this.lists[kind].push(mark);
@@ -123,9 +132,10 @@ class Marks {
     this.frames.ask();
   }
 
-  // Labels stand at their points; those of points behind a surface are pale, those behind the camera hidden.
+  // Labels stand at their points, or below other labels; those of points behind a surface are pale, those behind the camera
+  // hidden.
   place() {
-    const { view, picture } = this.frames, { focal, center } = lensIn(view);
+    const { view, picture } = this.frames, { focal, center } = lensIn(view), boxes = [];
     for (const { made, line, points } of this.drawn) {
       const seen = points.map((point) => {
         const [x, y, z] = view.axes.map((axis) => dot(axis, minus(point, view.eye)));
@@ -134,12 +144,22 @@ class Marks {
       made.hidden = seen.includes(null);
       line.style.visibility = made.hidden ? "hidden" : "visible";
       if (made.hidden) continue;
-      const [from, to] = [seen[0], seen.at(-1)], [x, y] = plus(from, to).map((each) => each / 2);
-      made.style.transform = `translate(${x}px, ${y}px)`;
+      const [from, to] = [[...seen[0]], [...seen.at(-1)]], [x, y] = plus(from, to).map((each) => each / 2);
+      const box = { x, top: y, width: made.offsetWidth, height: made.offsetHeight + GAP };
+      for (const other of boxes.sort((a, b) => a.top - b.top)) {
+        const beside = x >= other.x + other.width || other.x >= x + box.width;
+        if (!beside && box.top < other.top + other.height && other.top < box.top + box.height) box.top = other.top + other.height;
+      }
+      boxes.push(box);
+      const down = box.top - y;
+      made.style.transform = `translate(${x}px, ${box.top}px)`;
+      made.style.setProperty("--down", `${down}px`);
+      if (points.length === 1) to[1] += down;  // a line from the point to its label
       for (const [name, at] of Object.entries({ x1: from[0], y1: from[1], x2: to[0], y2: to[1] })) line.setAttribute(name, at);
       if (points.length > 1) continue;
       const away = picture.depth(view, x, y);
-      made.classList.toggle("behind", away > 0 && away < 0.95 * length(minus(points[0], view.eye)));
+      const behind = away > 0 && away < 0.95 * length(minus(points[0], view.eye));
+      for (const drawn of [made, line]) drawn.classList.toggle("behind", behind);
     }
   }
 }

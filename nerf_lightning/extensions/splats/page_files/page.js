@@ -181,7 +181,7 @@ class Frames {
     if (this.keys.size && elapsed < 500) fly(this, elapsed / 1000);
     if (this.player.playing) this.player.advance();
     if (this.turning) this.turntable(Math.min(elapsed, 200) / 1000);
-    place(this.view);
+    place(this);
     this.marks.place();
     if (this.keys.size || this.player.playing || this.turning || performance.now() - this.movedAt < PAUSE) {
       // Pixels take the time, and the first frame after a pause tells nothing of it.
@@ -212,18 +212,22 @@ function fly(frames, seconds) {
   frames.movedAt = performance.now();
 }
 
-// The photograph lies over what its camera shows.
-function place(view) {
-  const photograph = byId("photograph"), seam = byId("seam"), source = sourceOf(view.photograph);
+// The photograph lies over what its camera shows. Until somebody moves, scenes without bounds, where nothing may be known
+// outside of its frame, are dark there.
+function place({ view, turning }) {
+  const [photograph, seam, around] = ["photograph", "seam", "around"].map(byId), source = sourceOf(view.photograph);
+  document.body.classList.toggle("framed", view.about.unbounded && (turning || view.photograph !== null));
   const share = Number(byId("wipe").value) / 100;
   photograph.hidden = byId("wiping").hidden = !source;
   seam.hidden = !source || share === 0 || share === 1;
   for (const button of document.querySelectorAll("#photographs button")) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
-  if (!source) return;
   const { lens } = view, { scale, center } = lensIn(view), [left, top] = plus(center, lens.center, -scale);
   const box = { width: scale * lens.width, height: scale * lens.height, left, top };
+  const edges = { left, top, right: left + box.width, bottom: top + box.height };
+  for (const [name, pixels] of Object.entries(edges)) around.style.setProperty(`--${name}`, `${pixels}px`);
+  if (!source) return;
   for (const [name, pixels] of Object.entries(box)) photograph.style[name] = `${pixels}px`;
   photograph.style.setProperty("--at", `${100 * share}%`);
   for (const [name, pixels] of Object.entries({ left: left + share * box.width, top, height: box.height })) seam.style[name] = `${pixels}px`;
@@ -339,7 +343,7 @@ function next(frames, by) {
 
 function listenToControls(frames) {
   byId("shown").addEventListener("change", (event) => show(frames, Number(event.target.value)));
-  byId("wipe").addEventListener("input", () => place(frames.view));
+  byId("wipe").addEventListener("input", () => place(frames));
   byId("back").addEventListener("click", () => home(frames));
   byId("turn").addEventListener("click", () => frames.turn(!frames.turning));
   byId("picture").addEventListener("click", () => savePicture(frames));

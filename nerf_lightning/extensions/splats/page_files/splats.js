@@ -45,7 +45,8 @@ class Picture {
   }
 
   linked() {
-    const gl = this.gl, program = gl.createProgram(), head = `#version 300 es\n#define DEGREE ${this.about.degree}\n`;
+    const gl = this.gl, program = gl.createProgram(), { degree, depth_colors: colors } = this.about;
+    const head = `#version 300 es\n#define DEGREE ${degree}\n#define DEPTH_COLORS ${colors.length}\n`;
     for (const [kind, id] of [[gl.VERTEX_SHADER, "vertices"], [gl.FRAGMENT_SHADER, "pixels"]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, head + byId(id).textContent);
@@ -81,6 +82,7 @@ class Picture {
     gl.uniform2fv(this.at("scales"), about.scales);
     gl.uniform2fv(this.at("colors"), about.colors);
     gl.uniform1f(this.at("harmonics"), about.harmonics);
+    gl.uniform3fv(this.at("depth_colors"), about.depth_colors.flat());
     if (gl.getError() !== gl.NO_ERROR) throw new Refusal("This device has too little graphics memory for the scene. Ask for a file with fewer splats (what.num_splats=100000).");
   }
 

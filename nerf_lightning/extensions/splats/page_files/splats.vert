@@ -10,6 +10,7 @@ uniform vec3 eye;
 uniform vec2 focal, center, size, scales, colors, depths;
 uniform float dilation, harmonics;
 uniform int shown;
+uniform vec3 depth_colors[DEPTH_COLORS];  // From far to near.
 
 out vec2 place;  // In standard deviations.
 flat out vec4 shade;
@@ -91,7 +92,9 @@ void main() {
 
   vec3 color;
   if (shown == 1) {
-    color = vec3(1.0 - clamp((length(mean - eye) - depths.x) / (depths.y - depths.x), 0.0, 1.0));
+    float scaled = float(DEPTH_COLORS - 1) * (1.0 - clamp((length(mean - eye) - depths.x) / (depths.y - depths.x), 0.0, 1.0));
+    int below = min(int(scaled), DEPTH_COLORS - 2);
+    color = mix(depth_colors[below], depth_colors[below + 1], scaled - float(below));
   } else if (shown == 2) {
     vec3 flattest = deviations.x < min(deviations.y, deviations.z) ? axes[0] : deviations.y < deviations.z ? axes[1] : axes[2];
     color = 0.5 - 0.5 * sign(dot(flattest, look)) * flattest;

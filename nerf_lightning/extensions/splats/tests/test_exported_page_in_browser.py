@@ -86,6 +86,9 @@ def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
             controls = driver.find_element("css selector", "#numbers").text
             assert ("two fingers" in controls, "Shift and drag" in controls) == (size == "phone", size != "phone")
             assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
+            controls = "[...document.querySelectorAll('button, select, summary, label')]"
+            heights = driver.execute_script(f"return {controls}.map(each => each.getBoundingClientRect().height)")
+            assert min(filter(None, heights)) >= (40 if size == "phone" else 24)
             before = "document.getElementById('full').getBoundingClientRect()"
             left = driver.execute_script(f"return {before}.left")
             driver.execute_script("document.getElementById('tools').open = false")
@@ -134,6 +137,11 @@ def test_a_scene_without_bounds_is_shown_as_the_rasterizer_draws_it(tmp_path):
         assert psnr(found, drawn(page, read_page(page)[0]["first"], width, height, 0.0)) > 38
         assert found.std() > 0.1
         assert found.min(axis=2).mean() > 0.05  # the wall is there
+        framed = "return document.body.classList.contains('framed')"  # dark outside of the photograph's frame
+        assert driver.execute_script(framed)
+        drag(driver, 10, 0)
+        wait_for(driver, "still")
+        assert not driver.execute_script(framed)
         assert driver.get_log("browser") == []
 
 

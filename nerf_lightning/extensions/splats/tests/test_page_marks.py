@@ -11,10 +11,10 @@ from support.running import refused
 from support.shiny_ball import all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.extensions.splats.page import PageExport
-from nerf_lightning.extensions.splats.page_file import average_view, sway
+from nerf_lightning.extensions.splats.page_file import sway
 from nerf_lightning.extensions.splats.page_marks import read_marks
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.geometry.world_frame import similarity
+from nerf_lightning.nerf.geometry.world_frame import central_view, similarity
 
 TURN = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 RECORD = record_of(all_around(), to_user=similarity(TURN, torch.tensor([50.0, -3.0, 2.0]), 3.0))
@@ -86,12 +86,10 @@ def around(*degrees):
     return replace(RECORD, cameras=replace(cameras, c2w=c2w), splits={"train": views, "test": (0,)})
 
 
-def test_the_first_view_is_the_most_average_of_the_training_views():
+def test_the_first_view_is_the_most_central_of_the_training_views():
     record = around(0.0, 30.0, 40.0, 10.0, 50.0)
-    assert average_view(record, range(5)) == 1
-    assert average_view(record, (0, 4, 3)) == 3
-    only = replace(record, splits={"train": (0, 4), "test": (1,)})
-    assert average_view(only, (1, 4)) == 4
+    assert central_view(record) == 1
+    assert central_view(replace(record, splits={"train": (4, 0, 3), "test": (1,)})) == 3
 
 
 @pytest.mark.parametrize(

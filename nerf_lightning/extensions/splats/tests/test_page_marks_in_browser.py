@@ -2,6 +2,7 @@
 
 import json
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,6 +91,25 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
     focal = read_page(page)[0]["cameras"][2]["focal"][0] * min(width, height) / 32
     across = 0.03 * 30 / focal * (np.linalg.norm(eye) - np.linalg.norm(point))
     assert float(told.removesuffix(" m")) == pytest.approx(across, rel=0.15)
+
+
+def test_labels_at_one_point_do_not_overlap_and_same_texts_are_numbered(page):
+    with opened(page.as_uri(), 500, 400) as driver:
+        run = driver.execute_script
+        wait_for(driver, "still")
+        run("window.prompt = () => 'mine'")
+        for _ in range(3):
+            press(driver, "v")
+            press(driver, "n")
+            press(driver, "enter")
+        wait_for(driver, "still")
+        assert run("return [...document.querySelectorAll('#views button')].map(each => each.textContent)")[1:] == (
+            ["mine", "mine (2)", "mine (3)"]
+        )
+        box = "const {top, bottom} = each.getBoundingClientRect(); return [top, bottom]"
+        notes = "[...document.querySelectorAll('#pins .note')].filter(each => each.textContent.startsWith('mine'))"
+        boxes = run(f"return {notes}.map(each => {{ {box} }})")
+        assert all(below[0] >= above[1] for above, below in pairwise(boxes))
 
 
 def test_it_turns_by_itself_until_it_is_touched(page):

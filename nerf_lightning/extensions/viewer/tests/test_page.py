@@ -6,12 +6,14 @@ import socket
 import time
 
 import msgspec
+import numpy as np
 import pytest
 from support.served_page import HEIGHT, served
 
 from nerf_lightning.extensions.viewer import ports
 from nerf_lightning.extensions.viewer.ports import free_port
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.world_frame import central_view
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,14 @@ def test_an_error_while_drawing_for_one_ends_neither_the_page_nor_the_loop(page,
     other.look_from(50)
     other.wait_for(len)  # it is served again when it requests what can be drawn
     other.close()
+
+
+def test_it_starts_where_the_exported_page_does(page):
+    cameras = page.page.photographs.record.cameras
+    c2w, start = cameras.c2w[central_view(page.page.photographs.record)], page.page.server.initial_camera
+    assert start.position.tolist() == c2w[:, 3].tolist()
+    away = start.position - start.look_at
+    assert away / np.linalg.norm(away) == pytest.approx(c2w[:, 2].numpy(), abs=1e-5)
 
 
 def test_who_leaves_is_seen_off(page):
