@@ -98,12 +98,12 @@ test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
 
 # Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none. The latter is what
-# trainer.precision=auto means, which no test below the commands asks for.
+# trainer.precision=auto means, which of the tests below the commands that of batch norm alone asks for.
 BFLOAT16 := $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null)
 OTHER := $(if $(BFLOAT16),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
 OTHER_TESTS := $(addprefix tests/commands/test_,memory_plan.py trainer_settings.py train_eval_render.py processes.py fast_path.py) \
-	$(if $(BFLOAT16),tests/training/test_step.py $(addprefix tests/nerf/,test_matmul_precision.py test_disable_autocast.py kernels \
-	fields models rendering samplers) $(addprefix --ignore=tests/nerf/kernels/test_,gpu_targets.py backends.py))
+	tests/nerf/fields/test_batch_norm.py $(if $(BFLOAT16),tests/training/test_step.py $(addprefix tests/nerf/,test_matmul_precision.py \
+	test_disable_autocast.py kernels fields models rendering samplers) $(addprefix --ignore=tests/nerf/kernels/test_,gpu_targets.py backends.py))
 test-other: setup ## Run a part of the tests as on the other kind of CPU (bfloat16 on or off), with one thread
 	@echo "as another machine: $(OTHER) OMP_NUM_THREADS=1"
 	@$(OTHER) OMP_NUM_THREADS=1 $(PYTEST) $(OTHER_TESTS)
