@@ -33,7 +33,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-slow test-ci test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-20s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -70,6 +70,9 @@ test-slow: setup ## Run the tests that take minutes: browsers, killed runs, kern
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
 
+test-ci: setup ## Run make test and make test-slow in one go: workers start once, and none waits in between
+	@$(PYTEST) -m "not exhaustive"
+
 test-core: setup ## Try the options and commands in a copy of the project without extensions; every test must be collected there
 	@$(VENV)/bin/python -m pytest -m "" tests/test_without_extensions.py
 
@@ -94,12 +97,13 @@ $(NERFBASELINES_VENV)/.ready: pyproject.toml constraints/torch.txt
 test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
 
-# Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none.
-OTHER := $(if $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
-OTHER_TESTS := tests/nerf/test_matmul_precision.py tests/nerf/test_disable_autocast.py tests/nerf/kernels tests/nerf/fields \
-	tests/nerf/models tests/nerf/rendering tests/nerf/samplers tests/training/test_step.py tests/commands/test_memory_plan.py \
-	tests/commands/test_trainer_settings.py tests/commands/test_train_eval_render.py tests/commands/test_processes.py \
-	tests/commands/test_fast_path.py $(addprefix --ignore=tests/nerf/kernels/,test_gpu_targets.py test_backends.py)
+# Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none. The latter is what
+# trainer.precision=auto means, which of the tests below the commands that of batch norm alone asks for.
+BFLOAT16 := $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null)
+OTHER := $(if $(BFLOAT16),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
+OTHER_TESTS := $(addprefix tests/commands/test_,memory_plan.py trainer_settings.py train_eval_render.py processes.py fast_path.py) \
+	tests/nerf/fields/test_batch_norm.py $(if $(BFLOAT16),tests/training/test_step.py $(addprefix tests/nerf/,test_matmul_precision.py \
+	test_disable_autocast.py kernels fields models rendering samplers) $(addprefix --ignore=tests/nerf/kernels/test_,gpu_targets.py backends.py))
 test-other: setup ## Run a part of the tests as on the other kind of CPU (bfloat16 on or off), with one thread
 	@echo "as another machine: $(OTHER) OMP_NUM_THREADS=1"
 	@$(OTHER) OMP_NUM_THREADS=1 $(PYTEST) $(OTHER_TESTS)

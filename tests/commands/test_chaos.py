@@ -221,7 +221,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, nev
     assert left == {"last.ckpt", "previous.ckpt", "best.ckpt"}, story
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @POSIX
 def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
     """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""

@@ -83,4 +83,5 @@ def small(model, **settings):
                 yield f"{place}.{name}={chosen[name]}"
 
     config = OmegaConf.to_container(composed("train", f"model={model}"), resolve=False)
-    return ["data.batch_rays=8", *within("model", config["model"]), *within("encoder", config["encoder"])]
+    changes = (change for part in ("model", "field", "encoder") for change in within(part, config[part]))
+    return ["data.batch_rays=8", *changes]

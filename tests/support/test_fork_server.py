@@ -16,31 +16,14 @@ def told(code, *arguments, **options):
     return process.returncode, output
 
 
-def test_it_has_its_own_folder_environment_arguments_and_session(tmp_path, monkeypatch):
-    monkeypatch.setenv("THIS_IS_HERE", "now")
-    code = "import os, sys; print(os.getcwd(), os.environ.get('THIS_IS_HERE'), os.environ.get('HOME'), sys.argv)"
-    assert told(code, 1, "two", cwd=tmp_path) == (0, f"{tmp_path} now {os.environ.get('HOME')} ['-c', '1', 'two']\n")
-    assert told(code, cwd=tmp_path, env={}) == (0, f"{tmp_path} None None ['-c']\n")
-    code = "import os; print(os.getsid(0) == os.getpid() == os.getpgid(0))"
-    assert told(code, start_new_session=True) == (0, "True\n")
-    assert told(code) == (0, "False\n")
-
-
-@pytest.mark.parametrize(
-    ("code", "expected", "words"),
-    [
-        ("import sys; sys.exit(3)", 3, ""),
-        ("import sys; sys.exit('no')", 1, "no\n"),
-        ("1 / 0", 1, "ZeroDivisionError"),
-        ("raise KeyboardInterrupt", -signal.SIGINT, "KeyboardInterrupt"),
-        ("import os; os.kill(os.getpid(), 9)", -9, ""),
-        ("import atexit; atexit.register(print, 'at the end')", 0, "at the end\n"),
-        ("import threading; threading.Timer(0.2, print, ['late']).start()", 0, "late\n"),
-    ],
-)
-def test_it_ends_as_any_process(code, expected, words):
-    number, output = told(code)
-    assert (number, words in output) == (expected, True), output
+def test_it_has_its_own_folder_environment_and_arguments_and_its_end_is_that_of_any_process(tmp_path):
+    code = (
+        "import atexit, os, sys; atexit.register(print, 'end'); print(os.getcwd(), dict(os.environ), sys.argv); 1 / 0"
+    )
+    number, output = told(code, "two", cwd=tmp_path, env={})
+    expected = {f"{tmp_path} {{}} ['-c', 'two']", "ZeroDivisionError: division by zero", "end"}
+    assert (number, expected - set(output.splitlines())) == (1, set()), output
+    assert told("raise KeyboardInterrupt")[0] == -signal.SIGINT
 
 
 def test_what_is_read_at_import_needs_a_process_of_its_own_and_a_call_of_nerf_in_this_one_changes_nothing(monkeypatch):

@@ -17,6 +17,8 @@ from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
 
+NARROW = {"depth": 3, "width": 32, "skip": 2, "blocks": 2, "image_width": 16}
+"""Of networks: how wide they are changes neither what waits nor where anything lies."""
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
 UPDATED = 4  # grids have been updated once
 TILE_POINTS = 128
@@ -43,7 +45,7 @@ def marked(*model):
 
 def run_on(there, model, precision):
     looks = model.startswith("view_transformer")  # by whole batches, so that what it reads can be counted
-    return step_by_step(model, there.device, precision, None if looks else TILE_POINTS, *small(model))
+    return step_by_step(model, there.device, precision, None if looks else TILE_POINTS, *small(model, **NARROW))
 
 
 def named_waits(model):
@@ -65,7 +67,7 @@ def step_and_render(there, run, waits):
 
 
 def losses_on_the_cpu(model):
-    run = step_by_step(model, torch.device("cpu"), "32-true", TILE_POINTS, *small(model))
+    run = step_by_step(model, torch.device("cpu"), "32-true", TILE_POINTS, *small(model, **NARROW))
     for _ in range(STEPS):
         run.step()
     return run.all_losses().tolist()
