@@ -20,6 +20,7 @@ from torch import Tensor
 from triton.runtime.errors import OutOfResources
 
 from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.hash_grid.cuda import BLOCK as GRID_BLOCK
 from nerf_lightning.nerf.kernels.mlp.cuda import (
     BACKWARD,
     FORWARD,
@@ -37,8 +38,7 @@ from nerf_lightning.nerf.kernels.mlp.cuda import (
 from nerf_lightning.nerf.kernels.padding import end_of_rows
 
 BLOCK, BACKWARD_BLOCK = 128, 64
-PADDING = tl.constexpr(128)
-"""Samples of a block of the hash grid's kernels, which read gradients up to the end of the last block."""
+PADDING = tl.constexpr(GRID_BLOCK)
 WIDEST = 64
 
 
