@@ -102,10 +102,10 @@ class TrainStep:
             factor = self.schedule(progress.step, self.num_steps)
             for group in optimizer.param_groups:
                 group["lr"] = factor * group.setdefault("base_lr", group["lr"])
-            if isinstance(self.gradients, RecordedGradients):
+            if self.gradients is not self.tiles:
                 taken, seen = True, self._replayed(self.gradients, batch, optimizer, backward, measure_gradients)
             else:
-                seen = self.gradients(batch, self.key, self._share(batch), backward)
+                seen = self.tiles(batch, self.key, self._share(batch), backward)
                 self._add_up(seen)
                 taken = self.guard.allows(seen.losses, objective.named_weights())
                 if taken:
@@ -128,19 +128,19 @@ class TrainStep:
         return Share(first * self.objective.pixels_per_patch, self.progress.batch_rays, ranks.total(batch.weight.sum()))
 
     def _replayed(
-        self, gradients: RecordedGradients, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool
+        self, gradients: Any, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool
     ) -> StepOutput:
         """Replay a step, with its update if the optimizer's can be recorded; the guard zeroes nonfinite gradients."""
         inner = getattr(optimizer, "optimizer", optimizer)  # Lightning's wrapper counts the steps
         recorded = inner if isinstance(inner, TableAdam) else None
         outputs: list[StepOutput] = []
 
-        def finish(seen: StepOutput) -> StepOutput:
-            self.guard.keep_finite(seen.losses, self.objective.named_weights())
-            seen = self._clipped(seen, measure_gradients)
+        def finish(output: StepOutput) -> StepOutput:
+            self.guard.keep_finite(output.losses, self.objective.named_weights())
+            output = self._clipped(output, measure_gradients)
             if recorded is not None:
                 recorded.update()
-            return seen
+            return output
 
         def compute() -> None:
             update = None if recorded is None else recorded.next_update
@@ -153,16 +153,16 @@ class TrainStep:
         optimizer.step(compute)
         return outputs[0]
 
-    def _add_up(self, seen: StepOutput) -> None:
-        ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
+    def _add_up(self, output: StepOutput) -> None:
+        ranks.add_up([output.losses, output.color_errors, *output.terms.values()])
         ranks.add_up_gradients(self.objective.parameters())
 
-    def _clipped(self, seen: StepOutput, measure_gradients: bool) -> StepOutput:
+    def _clipped(self, output: StepOutput, measure_gradients: bool) -> StepOutput:
         if measure_gradients:
-            seen = replace(seen, gradient_norms=_norms(self.objective.model))
+            output = replace(output, gradient_norms=_norms(self.objective.model))
         if self.clip_norm is not None:
             clip_grad_norm_(self.objective.parameters(), self.clip_norm)
-        return seen
+        return output
 
     def _choose_batch(self) -> None:
         """Choose the number of rays of the next steps by the number of samples per ray."""

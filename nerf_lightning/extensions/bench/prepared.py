@@ -61,8 +61,11 @@ class Bench:
             self.train_on(self.batch)
 
     def train_on(self, batch: Batch) -> None:
-        """Compute gradients and update; if training replays steps, by a replay, with its NaN guard."""
-        self._update(self.optimizer, lambda: self.train_step.gradients(batch, self.train_step.key))
+        """Compute gradients and update; if training replays steps, take a whole one, of which the replay is most."""
+        if self.train_step.gradients.replays:
+            self.train_step(batch, self.optimizer)
+        else:
+            self._update(self.optimizer, lambda: self.train_step.gradients(batch, self.train_step.key))
 
     def train_one_by_one(self, steps: int) -> None:
         """Take steps on the one batch, without tiles as in a replay, launching kernels one by one."""

@@ -112,9 +112,9 @@ class _Fused(torch.autograd.Function):
         ctx: Any, features: Tensor, kernels: Any, shared: Tensor, samples: Any, how: Any, layers: int, *weights: Tensor
     ) -> tuple[Tensor, Tensor]:
         mlps = [each.detach() for each in weights[:layers]], [each.detach() for each in weights[layers:]]
-        ctx.kernels, ctx.given = kernels, (shared.detach(), samples, *mlps, how)
+        ctx.kernels, ctx.arguments = kernels, (shared.detach(), samples, *mlps, how)
         keep = any(ctx.needs_input_grad)
-        density, rgb, hidden = kernels.forward(features.detach(), *ctx.given, keep)
+        density, rgb, hidden = kernels.forward(features.detach(), *ctx.arguments, keep)
         ctx.save_for_backward(features, hidden)
         return density, rgb
 
@@ -122,7 +122,7 @@ class _Fused(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
         features, hidden = ctx.saved_tensors
-        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, hidden, features, *ctx.given)
+        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, hidden, features, *ctx.arguments)
         return of_features, None, None, None, None, None, *of_weights
 
 

@@ -32,7 +32,9 @@ class AdamUpdate:
 
     def set_numbers(self, numbers: Sequence[tuple[float, float, float, float, float]]) -> None:
         """Set each parameter's step_size, root_scale, b1, b2 and eps."""
-        self.numbers.copy_(torch.tensor(numbers, dtype=self.numbers.dtype), non_blocking=True)
+        there = torch.tensor(numbers, dtype=self.numbers.dtype)
+        # Pinned anew each time: an earlier copy may not have begun.
+        self.numbers.copy_(there.pin_memory() if self.numbers.is_cuda else there, non_blocking=True)
 
     def __call__(self) -> None:
         """Update the parameters in place."""
