@@ -97,8 +97,8 @@ $(NERFBASELINES_VENV)/.ready: pyproject.toml constraints/torch.txt
 test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
 
-# Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none. The latter is what
-# trainer.precision=auto means, which of the tests below the commands that of batch norm alone asks for.
+# Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none. Only what
+# trainer.precision=auto means then differs: besides commands, the tests of batch norm alone ask for it.
 BFLOAT16 := $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null)
 OTHER := $(if $(BFLOAT16),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
 OTHER_TESTS := $(addprefix tests/commands/test_,memory_plan.py trainer_settings.py train_eval_render.py processes.py fast_path.py) \

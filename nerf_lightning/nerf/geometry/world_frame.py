@@ -207,9 +207,11 @@ def directions_seen(scene: SceneRecord) -> tuple[Float[Tensor, "views"], Float[T
 def central_view(scene: SceneRecord) -> int:
     """Return the training view whose camera is nearest to the training cameras' mean, in place and direction.
 
+    Without training views, it is one of all views.
+
     Pages start there: the model knows most about what is there, and it is oriented like most photographs.
     """
-    train = list(scene.splits["train"])
+    train = list(scene.splits.get("train", ())) or list(range(len(scene.cameras.c2w)))
     c2w = scene.cameras.c2w[train]
     spread = c2w[:, :, 3].std(dim=0, correction=0).norm().clamp(min=1e-6)
     apart = c2w - c2w.mean(dim=0)

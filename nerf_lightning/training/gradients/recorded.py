@@ -163,7 +163,7 @@ class RecordedGradients:
         return kept.output
 
     def _recorded(self, batch: Batch, key: int, share: Share | None, rest: Rest | None) -> _Recording:
-        batch = batch.map(Tensor.clone)
+        batch = batch.map(lambda each: each.clone(memory_format=torch.contiguous_format))
         share = None if share is None else replace(share, weight=share.weight.clone())
         kept_key = torch.full((), key, device=batch.weight.device)
         for parameter in self.parameters:
@@ -204,8 +204,11 @@ def _inputs(batch: Batch, share: Share | None) -> list[Tensor]:
 
 
 def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
-    """Copy tensors, whatever their types, in one kernel."""
-    ours, theirs = ([each.contiguous().view(torch.int32) for each in tensors] for tensors in (targets, sources))
+    """Copy tensors, whatever their types, in one kernel; the targets are contiguous."""
+    ours, theirs = (
+        [each.view(torch.int32) for each in targets],
+        [each.contiguous().view(torch.int32) for each in sources],
+    )
     torch._foreach_copy_(ours, theirs)
 
 

@@ -90,6 +90,7 @@ def test_the_first_view_is_the_most_central_of_the_training_views():
     record = around(0.0, 30.0, 40.0, 10.0, 50.0)
     assert central_view(record) == 1
     assert central_view(replace(record, splits={"train": (4, 0, 3), "test": (1,)})) == 3
+    assert central_view(replace(record, splits={"test": (4, 0, 3)})) == 1  # none was trained on: one of all
 
 
 @pytest.mark.parametrize(

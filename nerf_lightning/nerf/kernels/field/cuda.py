@@ -7,7 +7,6 @@ the kernels without a GPU.
 """
 
 import functools
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple, no_type_check
@@ -23,21 +22,22 @@ from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
 from nerf_lightning.nerf.kernels.hash_grid.cuda import BLOCK as GRID_BLOCK
 from nerf_lightning.nerf.kernels.mlp.cuda import (
     BACKWARD,
+    BACKWARD_BLOCK,
+    BLOCK,
     FORWARD,
     INTERPRETED,
-    NARROWEST,
-    PROGRAMS,
     activated,
     layer_weights,
     multiply,
-    multiprocessors,
+    padded,
     passed_back,
     rows_of,
     store_sum,
+    sums_of_programs,
+    total,
 )
 from nerf_lightning.nerf.kernels.padding import end_of_rows
 
-BLOCK, BACKWARD_BLOCK = 128, 64
 PADDING = tl.constexpr(GRID_BLOCK)
 WIDEST = 64
 
@@ -156,19 +156,19 @@ def backward(
     if color_weights:
         rows, own = color_weights[0].shape[0], hidden.shape[1]
         shapes: list[tuple[int, ...]] = [(rows, own), (rows, shared.shape[1]), tuple(color_weights[1].shape)]
-        sums = _sums(shapes, count, features.device)
+        sums = sums_of_programs(shapes, count, features.device)
         arrays = hidden, shared.contiguous(), *where[:3], *_four(density_weights, color_weights)[2:], of_hidden, sums
         _backward_color[(len(sums),)](of_rgb.contiguous(), *arrays, how.least_slope, *numbers, *options, **BACKWARD)
-        of_own, of_shared, of_last = _unpadded(sums, shapes)
+        of_own, of_shared, of_last = total(sums, shapes)
         of_color = [torch.cat([of_own, of_shared], dim=1), of_last]
     shapes = [tuple(weight.shape) for weight in density_weights]
-    sums = _sums(shapes, count, features.device)
+    sums = sums_of_programs(shapes, count, features.device)
     arrays = of_hidden, features, *where[:4], *_four(density_weights, color_weights)[:2], of_features, sums
     flags = bool(color_weights), how.boxed
     _backward_density[(len(sums),)](
         of_density.contiguous(), *arrays, how.bias, LARGEST_SLOPE_RAW, *numbers, *flags, *options, **BACKWARD
     )
-    return of_features, [*_unpadded(sums, shapes), *of_color]
+    return of_features, [*total(sums, shapes), *of_color]
 
 
 def trial(device: str = "cuda") -> None:
@@ -191,10 +191,6 @@ def trial(device: str = "cuda") -> None:
         raise RuntimeError("a trial of its kernels gave wrong gradients")
 
 
-def _padded(width: int) -> int:
-    return max(NARROWEST, triton.next_power_of_2(width))
-
-
 def _four(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor]) -> list[Tensor]:
     """Return four weights, as the kernels expect; they ignore those that are not there."""
     return [each.contiguous() for each in (*density_weights, *(color_weights or density_weights))]
@@ -205,23 +201,7 @@ def _sizes(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor], s
     layers = density_weights[0].T, *density_weights, shared.T, *color_weights[:1]
     widths = [each.shape[0] for each in layers]
     widths += [1] * (5 - len(widths))
-    return *widths, *map(_padded, widths)
-
-
-def _unpadded(sums: Tensor, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
-    """Return the gradients of weights of these shapes from the sums of each program."""
-    total, gradients, offset = sums.sum(dim=0), [], 0
-    for rows, columns in shapes:
-        padded = _padded(rows), _padded(columns)
-        gradients.append(total[offset : offset + math.prod(padded)].view(padded)[:rows, :columns])
-        offset += math.prod(padded)
-    return gradients
-
-
-def _sums(shapes: Sequence[tuple[int, ...]], count: int, device: torch.device) -> Tensor:
-    """Return where each program puts the gradients of weights of these shapes."""
-    programs = max(1, min(PROGRAMS * multiprocessors(device), triton.cdiv(count, BACKWARD_BLOCK)))
-    return torch.empty(programs, sum(_padded(rows) * _padded(columns) for rows, columns in shapes), device=device)
+    return *widths, *map(padded, widths)
 
 
 @triton.jit

@@ -6,6 +6,7 @@ Products are of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs th
 
 import functools
 import logging
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, no_type_check
@@ -86,20 +87,12 @@ def backward(
     """Return the gradients of the inputs and of the weights; `saved` is what `forward` returned for the same `used`."""
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
-    programs = max(1, min(PROGRAMS * multiprocessors(grad.device), triton.cdiv(rows, BACKWARD_BLOCK)))
-    sums = of_points.new_empty(programs, sum(a * b for a, b in pairwise(widths)))
-    if not rows:
-        sums.zero_()
-    else:
-        arrays = grad.contiguous(), *_three(weights), saved, of_points, sums, used
-        flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
-        _backward[(programs,)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)
-    total, grads, offset = sums.sum(dim=0), [], 0
-    for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
-        of_weight = total[offset : offset + inner * outer].view(outer, inner)
-        grads.append(of_weight[: weight.shape[0], : weight.shape[1]])
-        offset += inner * outer
-    return of_points if wants_points else None, grads
+    shapes = [tuple(weight.shape) for weight in weights]
+    sums = sums_of_programs(shapes, rows, grad.device)
+    arrays = grad.contiguous(), *_three(weights), saved, of_points, sums, used
+    flags = len(weights), wants_points, BACKWARD_BLOCK, INTERPRETED
+    _backward[(len(sums),)](*arrays, rows, *_sizes(weights, widths), *flags, **BACKWARD)
+    return of_points if wants_points else None, total(sums, shapes)
 
 
 def trial(device: str = "cuda") -> None:
@@ -121,16 +114,35 @@ def trial(device: str = "cuda") -> None:
 
 
 @functools.cache
-def multiprocessors(device: torch.device) -> int:
-    """Return how many multiprocessors a device has."""
+def _multiprocessors(device: torch.device) -> int:
     there = device.type == "cuda" and torch.cuda.is_available()
     return torch.cuda.get_device_properties(device).multi_processor_count if there else ELSEWHERE
 
 
+def padded(width: int) -> int:
+    """Return the next width that tensor cores support."""
+    return max(NARROWEST, triton.next_power_of_2(width))
+
+
+def sums_of_programs(shapes: Sequence[tuple[int, ...]], count: int, device: torch.device) -> Tensor:
+    """Return where the programs of a backward pass over `count` rows store gradients of weights of these shapes."""
+    programs = max(1, min(PROGRAMS * _multiprocessors(device), triton.cdiv(count, BACKWARD_BLOCK)))
+    return torch.empty(programs, sum(padded(rows) * padded(columns) for rows, columns in shapes), device=device)
+
+
+def total(sums: Tensor, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    """Return the gradients of weights of these shapes, added up over the programs, in a fixed order."""
+    flat, gradients, offset = sums.sum(dim=0), [], 0
+    for rows, columns in shapes:
+        size = padded(rows), padded(columns)
+        gradients.append(flat[offset : offset + math.prod(size)].view(size)[:rows, :columns])
+        offset += math.prod(size)
+    return gradients
+
+
 def _padded_widths(weights: Sequence[Tensor]) -> list[int]:
-    """Return the widths of all layers' inputs and of the output, padded to sizes that tensor cores support."""
-    widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
-    return [max(NARROWEST, triton.next_power_of_2(width)) for width in widths]
+    """Return the widths of all layers' inputs and of the output, padded."""
+    return [*map(padded, (weights[0].shape[1], *(weight.shape[0] for weight in weights)))]
 
 
 def _three(weights: Sequence[Tensor]) -> list[Tensor]:
