@@ -3,6 +3,7 @@
 import re
 import signal
 import socket
+from contextlib import contextmanager
 from dataclasses import dataclass
 from subprocess import Popen
 from urllib.parse import urlsplit
@@ -46,12 +47,17 @@ def serve(*arguments):
 
 @pytest.fixture(scope="module")
 def page(finished_run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("viewer")
-    checkpoint = finished_run / "checkpoints" / "last.ckpt"
-    served = serve(f"ckpt={checkpoint}", f"port={unused_port()}", "max_height=96", f"paths.output_dir={folder}")
-    yield served
-    served.process.kill()
-    served.process.communicate()
+    with served(finished_run, tmp_path_factory.mktemp("viewer")) as page:
+        yield page
+
+
+@contextmanager
+def served(run, folder):
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    page = serve(f"ckpt={checkpoint}", f"port={unused_port()}", "max_height=96", f"paths.output_dir={folder}")
+    yield page
+    page.process.kill()
+    page.process.communicate()
 
 
 @pytest.fixture
@@ -103,15 +109,16 @@ def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
 
 
 @pytest.mark.minutes
-def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page, finished_run):
-    with opened(page.address) as browser:
+def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(train, tmp_path):
+    assert train("trainer.max_steps=200").code == 0  # the central photograph shows fog after 20
+    with served(tmp_path / "run", tmp_path / "views") as page, opened(page.address) as browser:
         first = wait_until(browser, lambda picture: picture.std() > 10)
         drag(browser, 120, 30)
         moved = wait_until(browser, lambda picture: np.abs(picture - first).mean() > 3)
         assert moved.std() > 10
         browser.refresh()
         wait_until(browser, lambda picture: picture.std() > 10)
-        assert f", {finished_run.name}<" in browser.page_source
+        assert ", run<" in browser.page_source
 
 
 def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
