@@ -46,7 +46,7 @@ JSON, AS_JSON = "--json", "json=true"
 HELP = """nerf: train radiance fields from photographs and render new views.
 
 usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
-       nerf doctor|table|selftest|bench --json          print the result as JSON
+       nerf COMMAND --json         print the table of a command as JSON
 
 {}
 
@@ -185,7 +185,7 @@ def _require_table(command: str) -> None:
 
     asked = command_named(command)
     if asked is None or "json" not in known_names(asked):
-        raise InputError(f"nerf {command} prints no table: {JSON} is for nerf doctor, table, selftest and bench.")
+        raise InputError(f"nerf {command} prints no table: {JSON} is for commands that do, such as nerf doctor.")
 
 
 def _setting_of(word: str) -> str:

@@ -29,8 +29,7 @@ from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
-from nerf_lightning.runs.results import scene_of_run
-from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.summary import read_note, scene_of_run
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath

@@ -15,7 +15,7 @@ from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.command_folder import output_folder
-from nerf_lightning.runs.results import FILES
+from nerf_lightning.runs.summary import FILES
 
 
 def run(config: DictConfig) -> str:

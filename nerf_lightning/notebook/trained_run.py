@@ -16,7 +16,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.notebook.run import of_scene
 from nerf_lightning.notebook.trained_model import TrainedModel, load
-from nerf_lightning.runs.results import FILES
+from nerf_lightning.runs.summary import FILES
 from nerf_lightning.training.launch.processes import num_processes
 
 

@@ -17,8 +17,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.metrics import depth_scale, facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import Report, embedded, embedded_file, embedded_video
-from nerf_lightning.runs.results import scene_of_run
-from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.summary import read_note, scene_of_run
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24

@@ -4,13 +4,16 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from nerf_lightning.config.setting_rules import PLACES
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 
+Measured = Literal["run", "eval"]
+FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
 CLASS = "._target_"
 DECIMAL = re.compile(r"[-+]?(\d+\.\d*|\.\d+|\d+(?=[eE]))([eE][-+]?\d+)?")
 
@@ -50,6 +53,29 @@ def read_run(folder: Path) -> RunSummary:
 def read_note(folder: Path) -> dict[str, Any]:
     """Return the content of `run.json`; empty if it is missing or damaged."""
     return read_json_object(folder / "run.json")
+
+
+def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
+    """Return the scene's name; if that is only its format's, the name of its folder or file."""
+    name = str(protocol.get("scene", "")) or "not said"
+    if name != str(origin.get("scene", overrides.get("scene"))):
+        return name
+    root, *files = (Path(overrides.get(key, "").strip("'\"")) for key in PLACES)
+    return root.name or next((file.stem for file in files if file.stem), name)
+
+
+def scene_of_run(name: str, folder: Path) -> str:
+    """Return the name of the scene that a run trains on, whose record is called `name`."""
+    return scene_name({"scene": name}, choices_of_run(folder), read_run(folder).overrides)
+
+
+def choices_of_run(folder: Path) -> dict[str, Any]:
+    """Return the picked scene and model, for results that do not name them."""
+    try:
+        choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
+        return {key: choices[key] for key in ("scene", "model")}
+    except (InputError, LookupError, TypeError):
+        return {}
 
 
 def folders_of_runs(root: Path) -> list[Path]:

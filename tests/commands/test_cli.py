@@ -15,7 +15,7 @@ from nerf_lightning.config.hydra_versions import IS_1_3
 def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkeypatch):
     result = nerf("--help")
     assert result.code == 0
-    for name in ("train", "eval", "render", "selftest"):
+    for name in ("train", "eval", "render", "doctor"):
         assert f"\n  {name}" in result.out
     assert nerf().out == result.out
     monkeypatch.setenv("COLUMNS", "80")
@@ -24,7 +24,7 @@ def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkey
 
 
 def test_json_is_refused_without_a_table_and_what_readers_share_is_no_scene_and_no_command(nerf):
-    said(nerf("train", "--json"), "nerf train prints no table", "doctor, table, selftest and bench")
+    said(nerf("train", "--json"), "nerf train prints no table", "such as nerf doctor")
     assert "There is no command 'capture_defaults'" in nerf("capture_defaults").err
     refused = nerf("train", "scene=capture").err
     assert "There is no scene=capture." in refused
@@ -118,7 +118,7 @@ def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypa
 def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf):
     said(nerf("train", "optimizer.fused=true"), "optimizer.fused is a setting of optimizer=adam, which is not chosen.")
     assert "It belongs to training: nerf help optimizer.lr." in nerf("render", "optimizer.lr=1").err
-    said(nerf("selftest", "experiment=quickstart"), "nerf selftest has no setting experiment. It belongs to training")
+    said(nerf("doctor", "experiment=quickstart"), "nerf doctor has no setting experiment. It belongs to training")
     said(nerf("train", "+experiment=quickstart"), "leave out the +. Type experiment=quickstart.")
     said(nerf("train", "trainer.accumulate_grad_batches=2"), "accumulate_grad_batches is data.batch_rays")
     said(nerf("train", "trainer.gradient_clip_val=1"), "gradient_clip_val is trainer.clip_norm here")

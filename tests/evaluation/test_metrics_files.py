@@ -10,7 +10,7 @@ from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.evaluation.metrics_files import METRICS, summary, write_metrics
 from nerf_lightning.files.json_files import write_json
-from nerf_lightning.runs.results import read_result
+from nerf_lightning.runs.summary import read_run
 
 
 def strict_json(path):
@@ -34,7 +34,7 @@ def test_a_view_without_any_number_is_null_and_one_that_is_background_alone_keep
     white, render = torch.ones(16, 16, 3), torch.full((16, 16, 3), 0.9)
     rows = [row("empty", **image_metrics(white, white)), row("b", **image_metrics(render, white))]
     write_metrics(tmp_path, summary(rows))
-    assert read_result(tmp_path, "run").values["psnr"] == pytest.approx(60.0, abs=1e-3)
+    assert read_run(tmp_path).psnr == pytest.approx(60.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])

@@ -9,9 +9,9 @@ import os
 import numpy as np
 import pytest
 import torch
+from support.scenes import ball_scene
 
 from nerf_lightning.compute.devices import prepare_machine
-from nerf_lightning.selftest.training import FOCAL, NUM_VIEWS, ball_scene
 
 CHOSEN = os.environ.get("NERF_LIGHTNING_GPU_TESTS_ON", "cuda")
 
@@ -42,9 +42,9 @@ def trainer(device):
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory):
     """The ball in front of black as an npz file."""
-    path, scene = tmp_path_factory.mktemp("capture") / "ball.npz", ball_scene()
-    rgba = torch.stack([scene.pixels.view(view) for view in range(NUM_VIEWS)]).float() / 255
-    poses = torch.eye(4).repeat(NUM_VIEWS, 1, 1)
+    path, scene = tmp_path_factory.mktemp("capture") / "ball.npz", ball_scene(10, 20)
+    rgba = torch.stack([scene.pixels.view(view) for view in range(10)]).float() / 255
+    poses = torch.eye(4).repeat(10, 1, 1)
     poses[:, :3] = scene.cameras.c2w
-    np.savez(path, images=(rgba[..., :3] * rgba[..., 3:]).numpy(), poses=poses.numpy(), focal=FOCAL)
+    np.savez(path, images=(rgba[..., :3] * rgba[..., 3:]).numpy(), poses=poses.numpy(), focal=32.0)
     return path

@@ -13,14 +13,15 @@ import torch
 from lightning.pytorch import Callback
 from support.configs import options
 from support.gpu_training import default_callbacks, step_by_step
+from support.scenes import ball_scene
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.ragged_level import RaggedLevel
-from nerf_lightning.selftest.training import METHODS, ball_scene
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.system import RadianceFieldSystem
 
+training = pytest.importorskip("nerf_lightning.extensions.selftest.training")
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.filterwarnings("ignore:Synchronization debug mode", "ignore:Warning. Profiler clears events"),
@@ -103,10 +104,10 @@ class Watch(Callback):
             torch.cuda.set_sync_debug_mode("default")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", training.METHODS)
 @pytest.mark.parametrize("resident", [True, False])
 def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, resident, device, tmp_path):
-    train_step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *METHODS[method]).training
+    train_step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *training.METHODS[method]).training
     settings = TrainerSettings(
         max_steps=STEPS, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=STEPS
     )
@@ -116,7 +117,14 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     quiet = [each for each in default_callbacks() if type(each).__name__ in ("CollapseGuard", "NanGuard", "Monitor")]
     trainer = settings.build(tmp_path, STEPS, [*quiet, watch], [])
     budget = "auto" if resident else 0
-    data = RayDataModule(ball_scene(), train_step.progress, 0, batch_rays=96, val_rays=96, device_budget=budget)
+    data = RayDataModule(
+        ball_scene(10, 20, background="random"),
+        train_step.progress,
+        0,
+        batch_rays=96,
+        val_rays=96,
+        device_budget=budget,
+    )
     with warnings.catch_warnings(record=True) as watch.caught:
         warnings.simplefilter("always")
         trainer.fit(system, data)

@@ -7,11 +7,10 @@ from support.gpu_training import step_by_step
 from support.tape import replay_steps
 
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
-from nerf_lightning.selftest import training
-from nerf_lightning.selftest.check import carried_out, gradient_bound
-from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.gradients.recorded import CudaGraphs
 
+training = pytest.importorskip("nerf_lightning.extensions.selftest.training")
+check = pytest.importorskip("nerf_lightning.extensions.selftest.check")
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 STEPS, TILE_POINTS = 50, 8192
 CPU = torch.device("cpu")
@@ -44,10 +43,10 @@ def test_every_model_follows_the_cpu(model, device):
 
 
 @pytest.mark.parametrize("matmul_precision", ["float32", "tf32", "bfloat16"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", training.METHODS)
 def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, device):
     chosen = training.checks(device, (matmul_precision,))
-    rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {matmul_precision}: ")]
+    rows = [check.carried_out(each) for each in chosen if each.name.startswith(f"{method}, {matmul_precision}: ")]
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
 
 
@@ -58,7 +57,7 @@ def test_compiled_fields_compute_the_same(cuda):
     made = training.Training("nerf_tiny", cuda, "float32", None)
     assert made.train_step.objective.model.compile_fields()
     apart = training.gradients_apart(made.gradients(), training.reference_gradients("nerf_tiny"))
-    assert apart < gradient_bound("float32", training.LAYERS)
+    assert apart < check.gradient_bound("float32", training.LAYERS)
 
 
 @pytest.mark.parametrize("model", ["fast", "fast_small", "fast_large"])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import torch
 from omegaconf import OmegaConf
 from support.configs import composed
-from support.scenes import ball_scene as many_views
+from support.scenes import ball_scene
 
 from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
@@ -13,7 +13,6 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.selftest.training import ball_scene
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -57,7 +56,7 @@ def step_by_step(
     config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null", *changes)
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     looks = model.startswith("view_transformer")  # at up to ten photographs for each view
-    scene, progress = many_views(24) if looks else ball_scene(), Progress()
+    scene, progress = ball_scene(24) if looks else ball_scene(10, 20, background="random"), Progress()
     training = build_step(config, settings, scene, progress)
     training.objective.to(device)
     training.num_steps = 1000

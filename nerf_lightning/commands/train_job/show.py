@@ -32,7 +32,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
-from nerf_lightning.runs.results import FILES
+from nerf_lightning.runs.summary import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 
 ROWS = 15  # Of the profile: the slowest actions, including everything they called

@@ -19,7 +19,7 @@ from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.geometry.world_frame import central_view
 from nerf_lightning.nerf.types.scene import SceneRecord
-from nerf_lightning.runs.results import scene_of_run
+from nerf_lightning.runs.summary import scene_of_run
 from nerf_lightning.video.paths.base import frame_of
 
 

@@ -3,7 +3,7 @@
 import pytest
 from support.browser import opened
 
-from nerf_lightning.commands.table import write_table_page
+from nerf_lightning.extensions.table.commands.table import write_table_page
 
 pytestmark = pytest.mark.minutes
 

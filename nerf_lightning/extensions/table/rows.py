@@ -8,11 +8,11 @@ from nerf_lightning.config.overrides import leaves
 from nerf_lightning.config.setting_rules import meaning_of
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.extensions.table.find_results import FoundResults, RunResult
+from nerf_lightning.extensions.table.published import published_for
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.runs.published import published_for
-from nerf_lightning.runs.results import FoundResults, RunResult
 from nerf_lightning.runs.summary import differing_keys
 from nerf_lightning.runs.table_cells import Row
 

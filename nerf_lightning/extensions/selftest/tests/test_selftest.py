@@ -5,10 +5,10 @@ import json
 import pytest
 from support.running import done, said
 
-from nerf_lightning.commands import selftest
+from nerf_lightning.extensions.selftest import training
+from nerf_lightning.extensions.selftest.commands import selftest
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
-from nerf_lightning.selftest import training
 
 
 @pytest.fixture

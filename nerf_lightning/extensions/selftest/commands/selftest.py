@@ -16,13 +16,13 @@ from nerf_lightning import __version__
 from nerf_lightning.compute.precision import has_tf32
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.evaluation.protocol import environment
+from nerf_lightning.extensions.selftest import kernels, training
+from nerf_lightning.extensions.selftest.check import Row, carried_out, remarks, result_table
 from nerf_lightning.files.json_files import print_json, write_json
 from nerf_lightning.messages.console import StdoutConsole, say, say_written, spoken, stderr_console
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.command_folder import output_folder
-from nerf_lightning.selftest import kernels, training
-from nerf_lightning.selftest.check import Row, carried_out, remarks, result_table
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 DEVICES = ("cpu", "cuda")

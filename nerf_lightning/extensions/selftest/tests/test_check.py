@@ -6,9 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nerf_lightning.commands import selftest as module
-from nerf_lightning.commands.selftest import machine
-from nerf_lightning.selftest.check import (
+from nerf_lightning.extensions.selftest.check import (
     CannotRun,
     Check,
     carried_out,
@@ -18,6 +16,8 @@ from nerf_lightning.selftest.check import (
     remarks,
     value_bound,
 )
+from nerf_lightning.extensions.selftest.commands import selftest as module
+from nerf_lightning.extensions.selftest.commands.selftest import machine
 
 
 def a_check(difference, bound=0.1):

@@ -9,6 +9,7 @@ from torch import Tensor
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.extensions.selftest.check import Check, gradient_bound, norm_apart
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.poses import look_at
@@ -16,7 +17,6 @@ from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, set_precision
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
-from nerf_lightning.selftest.check import Check, gradient_bound, norm_apart
 from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.validation import RayErrors

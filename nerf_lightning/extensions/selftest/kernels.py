@@ -7,6 +7,15 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from nerf_lightning.extensions.selftest.check import (
+    UNIT,
+    CannotRun,
+    Check,
+    gradient_bound,
+    norm_apart,
+    relative,
+    value_bound,
+)
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, CUDA_BACKENDS
@@ -21,7 +30,6 @@ from nerf_lightning.nerf.kernels.ragged.op import integrate
 from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS, MatmulPrecision
 from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
-from nerf_lightning.selftest.check import UNIT, CannotRun, Check, gradient_bound, norm_apart, relative, value_bound
 
 POINTS, RAYS, PACKED_SAMPLES, MLP_SIZES = 2048, 400, 60, (32, 64, 64, 3)
 ROUNDING, LAYERS = UNIT["float32"], len(MLP_SIZES) - 1

@@ -1,25 +1,31 @@
-"""Results in run folders: metrics, model, scene, and how they were measured."""
+"""Find the results in run folders: metrics, model, scene, and how they were measured."""
 
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from nerf_lightning.config.setting_rules import PLACES, meaning_of
+from nerf_lightning.config.setting_rules import meaning_of
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import mapping, number, read_json_object
 from nerf_lightning.files.regular import what_is
 from nerf_lightning.files.walk import walk
-from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.runs.summary import RunSummary, read_note, read_run, told_settings
+from nerf_lightning.runs.summary import (
+    FILES,
+    Measured,
+    RunSummary,
+    choices_of_run,
+    read_note,
+    read_run,
+    scene_name,
+    told_settings,
+)
 
-Measured = Literal["run", "eval"]
-FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
 SEED = re.compile(r"-?\d{1,18}", re.ASCII)
 
 
@@ -113,7 +119,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
         return None
     run, note = read_run(folder), read_note(folder)
     protocol = mapping(metrics.get("protocol"))
-    origin = _choices(folder) | mapping(metrics.get("origin"))
+    origin = choices_of_run(folder) | mapping(metrics.get("origin"))
     seed = str(origin.get("seed", run.overrides.get("seed", "0")))
     values = {metric: number(metrics.get(metric)) for metric in METRICS}
     values["frames_per_second"] = number(metrics.get("frames_per_second"))
@@ -133,26 +139,3 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
         protocol=protocol,
         origin=origin,
     )
-
-
-def scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
-    """Return the scene's name; if that is only its format's, the name of its folder or file."""
-    name = str(protocol.get("scene", "")) or "not said"
-    if name != str(origin.get("scene", overrides.get("scene"))):
-        return name
-    root, *files = (Path(overrides.get(key, "").strip("'\"")) for key in PLACES)
-    return root.name or next((file.stem for file in files if file.stem), name)
-
-
-def scene_of_run(name: str, folder: Path) -> str:
-    """Return the name of the scene that a run trains on, whose record is called `name`."""
-    return scene_name({"scene": name}, _choices(folder), read_run(folder).overrides)
-
-
-def _choices(folder: Path) -> dict[str, Any]:
-    """Return the picked scene and model, for results that do not name them."""
-    try:
-        choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
-        return {key: choices[key] for key in ("scene", "model")}
-    except (InputError, LookupError, TypeError):
-        return {}

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
+from nerf_lightning.extensions.selftest.check import carried_out
+from nerf_lightning.extensions.selftest.kernels import checks
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.march import cpu as march_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
 from nerf_lightning.nerf.kernels.ragged import cpu as ragged_cpu
 from nerf_lightning.nerf.kernels.ragged import op as packed
-from nerf_lightning.selftest.check import carried_out
-from nerf_lightning.selftest.kernels import checks
 
 CPU = torch.device("cpu")
 CHECKS = {check.name: check for check in checks(CPU, ("float32", "bfloat16"))}

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
+from nerf_lightning.extensions.selftest import training
+from nerf_lightning.extensions.selftest.check import carried_out
+from nerf_lightning.extensions.selftest.training import METHODS
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
 from nerf_lightning.nerf.kernels.render import dense as dense_rays_cpu
 from nerf_lightning.nerf.kernels.table_adam import cpu as adam_cpu
 from nerf_lightning.nerf.matmul_precision import Linear
-from nerf_lightning.selftest import training
-from nerf_lightning.selftest.check import carried_out
-from nerf_lightning.selftest.training import METHODS
 
 CHECKS = {check.name: check for check in training.checks(training.CPU, ("float32", "bfloat16"))}
 PSNR = f"PSNR after {training.STEPS} steps, dB"
