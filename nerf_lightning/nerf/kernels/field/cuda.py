@@ -54,6 +54,11 @@ class Samples(NamedTuple):
     used: Int[Tensor, "1"] | None
     """The index from which all samples are padding, on the device; None: there is no padding."""
 
+    @property
+    def size(self) -> int:
+        """The number of samples, padding included."""
+        return self.points.shape[0]
+
 
 class Activations(NamedTuple):
     """What turns raw outputs into density and color (`nerf.activations`)."""

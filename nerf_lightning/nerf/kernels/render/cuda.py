@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.activations import LARGEST_RAW, LARGEST_SLOPE_RAW
 from nerf_lightning.nerf.kernels.backends import cuda_backend
-from nerf_lightning.nerf.kernels.field.cuda import color_slope, inside, midpoint
+from nerf_lightning.nerf.kernels.field.cuda import Samples, color_slope, inside, midpoint
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.op import interpolate
 from nerf_lightning.nerf.kernels.mlp.op import mlp
@@ -49,9 +49,8 @@ def render(
         whole_from: gradients of samples nearer than this are scaled down (`rendering.near_gradients`); 0: of none.
         features: features of the hash grid, if `density` has computed them; None: they are computed here.
     """
-    where = _Where(rays, samples)
-    points = _points(rays, where, field)
-    density, rgb = _density_and_color(rays, where, points, field, matmul_precision, whole_from, features)[:2]
+    where = _located(rays, samples, field)
+    density, rgb = _density_and_color(rays, where, field, matmul_precision, whole_from, features)[:2]
     if isinstance(samples, RaggedSamples):
         return integrate(density, rgb, samples)
     shape = rays.near.shape[0], where.each
@@ -64,17 +63,15 @@ def density(
     rays: RayBundle, samples: RaggedSamples, field: FieldParts, matmul_precision: MatmulPrecision
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples features"]]:
     """Return the density and the features of the hash grid at samples, without gradients."""
-    where, plain = _Where(rays, samples), replace(field, color_weights=[])
+    where, plain = _located(rays, samples, field), replace(field, color_weights=[])
     with torch.no_grad():
-        points = _points(rays, where, field)
-        found, _, features = _density_and_color(rays, where, points, plain, matmul_precision, 0.0, None)
+        found, _, features = _density_and_color(rays, where, plain, matmul_precision, 0.0, None)
     return found, features
 
 
 def _density_and_color(
     rays: RayBundle,
-    where: "_Where",
-    points: Tensor,
+    where: Samples,
     field: FieldParts,
     matmul_precision: MatmulPrecision,
     whole_from: float,
@@ -83,18 +80,17 @@ def _density_and_color(
     """Return density, color and the features of the hash grid."""
     fused = _fused(field, rays, matmul_precision)
     dtype = torch.float32 if fused is None else torch.bfloat16
-    features = interpolate(field.table, points, field.layout, features, where.used, dtype)
-    shared = field.ray_features(rays) if field.color_weights else points.new_empty(1, 0)
+    features = interpolate(field.table, where.points, field.layout, features, where.used, dtype)
+    shared = field.ray_features(rays) if field.color_weights else where.points.new_empty(1, 0)
     if fused is not None:
         how = fused.Activations(field.bias, field.least_slope, whole_from, not field.contracted)
-        samples = fused.Samples(*where.arrays, points, where.each, where.used)
         weights = len(field.density_weights), *field.density_weights, *field.color_weights
-        return *_Fused.apply(features, fused, shared, samples, how, *weights), features
+        return *_Fused.apply(features, fused, shared, where, how, *weights), features
     hidden = mlp(features, field.density_weights, matmul_precision, where.used)
     raw = hidden.new_empty(0, 3)
     if field.color_weights:
         raw = mlp(_Joined.apply(hidden, shared, where), field.color_weights, matmul_precision, where.used)
-    return *_Activated.apply(hidden, raw, points, where, field, whole_from), features
+    return *_Activated.apply(hidden, raw, where, field, whole_from), features
 
 
 def _fused(field: FieldParts, rays: RayBundle, matmul_precision: MatmulPrecision) -> Any:
@@ -109,10 +105,17 @@ class _Fused(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, kernels: Any, shared: Tensor, samples: Any, how: Any, layers: int, *weights: Tensor
+        ctx: Any,
+        features: Tensor,
+        kernels: Any,
+        shared: Tensor,
+        where: Samples,
+        how: Any,
+        layers: int,
+        *weights: Tensor,
     ) -> tuple[Tensor, Tensor]:
         mlps = [each.detach() for each in weights[:layers]], [each.detach() for each in weights[layers:]]
-        ctx.kernels, ctx.arguments = kernels, (shared.detach(), samples, *mlps, how)
+        ctx.kernels, ctx.arguments = kernels, (shared.detach(), where, *mlps, how)
         keep = any(ctx.needs_input_grad)
         density, rgb, hidden = kernels.forward(features.detach(), *ctx.arguments, keep)
         ctx.save_for_backward(features, hidden)
@@ -142,51 +145,38 @@ def trial(device: str = "cuda") -> None:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
 
 
-class _Where:
-    """Positions of samples: their rays and distances."""
-
-    def __init__(self, rays: RayBundle, samples: RaggedSamples | RaySamples):
-        self.starts = samples.starts if isinstance(samples, RaggedSamples) else samples.edges.contiguous()
-        self.ends = samples.ends if isinstance(samples, RaggedSamples) else self.starts.view(-1)[1:]
-        self.ray_index = samples.ray_index if isinstance(samples, RaggedSamples) else self.starts
-        self.each = 0 if isinstance(samples, RaggedSamples) else samples.edges.shape[-1] - 1
-        """Samples per ray; 0: as the index says."""
-        self.used = samples.bounds[-1:] if isinstance(samples, RaggedSamples) else None
-        """Number of samples before the padding, on the device; None: no padding."""
-        self.count = self.starts.shape[0] if self.each == 0 else rays.near.shape[0] * self.each
-
-    @property
-    def arrays(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the arguments of the kernels."""
-        return self.ray_index, self.starts, self.ends
-
-    @property
-    def programs(self) -> tuple[int]:
-        """The number of programs, each of which takes a block of samples."""
-        return (triton.cdiv(self.count, BLOCK),)
+def _located(rays: RayBundle, samples: RaggedSamples | RaySamples, field: FieldParts) -> Samples:
+    """Return samples with their midpoints in the unit cube (`NGPField._unit`); without gradients."""
+    if isinstance(samples, RaggedSamples):
+        arrays, each, used = (samples.ray_index, samples.starts, samples.ends), 0, samples.bounds[-1:]
+        count = samples.starts.shape[0]
+    else:
+        edges, each, used = samples.edges.contiguous(), samples.edges.shape[-1] - 1, None
+        arrays, count = (edges, edges, edges.view(-1)[1:]), rays.near.shape[0] * each
+    points = torch.empty(count, 3, device=rays.near.device)
+    if count:
+        of_rays = rays.origins.detach().contiguous(), rays.directions.detach().contiguous(), field.aabb
+        _locate[_programs(count)](*of_rays, *arrays, points, count, each, field.contracted, BLOCK)
+    return Samples(*arrays, points, each, used)
 
 
-def _points(rays: RayBundle, where: _Where, field: FieldParts) -> Float[Tensor, "samples 3"]:
-    """Return the samples' midpoints in the unit cube (`NGPField._unit`); without gradients."""
-    out = torch.empty(where.count, 3, device=rays.near.device)
-    if where.count:
-        arrays = rays.origins.detach().contiguous(), rays.directions.detach().contiguous(), field.aabb, *where.arrays
-        _locate[where.programs](*arrays, out, where.count, where.each, field.contracted, BLOCK)
-    return out
+def _programs(count: int) -> tuple[int]:
+    """Return the number of programs, each of which takes a block of samples."""
+    return (triton.cdiv(count, BLOCK),)
 
 
 class _Joined(torch.autograd.Function):
     """The inputs of the color MLP: each sample's hidden features, and what its ray's samples share."""
 
     @staticmethod
-    def forward(ctx: Any, hidden: Tensor, shared: Tensor, where: _Where) -> Tensor:
+    def forward(ctx: Any, hidden: Tensor, shared: Tensor, where: Samples) -> Tensor:
         ctx.width, widths = hidden.shape[1], (hidden.shape[1], shared.shape[1])
-        out = hidden.new_empty(where.count, sum(widths))
-        if where.count:
+        out = hidden.new_empty(where.size, sum(widths))
+        if where.size:
             width = triton.next_power_of_2(sum(widths))
             arrays = hidden.contiguous(), shared.contiguous(), where.ray_index, out
-            programs = (triton.cdiv(where.count * width, 8 * BLOCK),)
-            _join[programs](*arrays, where.count, *widths, where.each, width, 8 * BLOCK // width)
+            programs = (triton.cdiv(where.size * width, 8 * BLOCK),)
+            _join[programs](*arrays, where.size, *widths, where.each, width, 8 * BLOCK // width)
         return out
 
     @staticmethod
@@ -200,32 +190,34 @@ class _Activated(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, hidden: Tensor, raw: Tensor, points: Tensor, where: _Where, field: FieldParts, whole_from: float
+        ctx: Any, hidden: Tensor, raw: Tensor, where: Samples, field: FieldParts, whole_from: float
     ) -> tuple[Tensor, Tensor]:
-        count, colored = where.count, bool(field.color_weights)
+        count, colored = where.size, bool(field.color_weights)
         hidden, raw = hidden.contiguous(), raw.contiguous()
         density, rgb = hidden.new_empty(count), hidden.new_empty(count, 3)
         if count:
             flags = hidden.shape[1], not field.contracted, colored, BLOCK
-            _activate[where.programs](hidden, raw, points, density, rgb, field.bias, LARGEST_RAW, count, *flags)
-        ctx.save_for_backward(hidden, points, rgb)
+            _activate[_programs(count)](hidden, raw, where.points, density, rgb, field.bias, LARGEST_RAW, count, *flags)
+        ctx.save_for_backward(hidden, rgb)
         ctx.where, ctx.field, ctx.whole_from = where, field, whole_from
         return density, rgb
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
-        hidden, points, rgb = ctx.saved_tensors
+        hidden, rgb = ctx.saved_tensors
         where, field = ctx.where, ctx.field
         colored = bool(field.color_weights)
         of_hidden, of_raw = torch.empty_like(hidden), torch.empty_like(rgb) if colored else rgb
-        if where.count:
-            arrays = hidden, points, rgb, of_density.contiguous(), of_rgb.contiguous(), *where.arrays[1:]
-            numbers = field.bias, LARGEST_SLOPE_RAW, field.least_slope, ctx.whole_from, where.count
+        if where.size:
+            arrays = hidden, where.points, rgb, of_density.contiguous(), of_rgb.contiguous(), where.starts, where.ends
+            numbers = field.bias, LARGEST_SLOPE_RAW, field.least_slope, ctx.whole_from, where.size
             flags, width = (not field.contracted, colored, ctx.whole_from > 0), hidden.shape[1]
             sizes = triton.next_power_of_2(width), BLOCK
-            _activate_back[where.programs](*arrays, of_hidden, of_raw, *numbers, where.each, width, *flags, *sizes)
-        return of_hidden, of_raw if colored else None, None, None, None, None
+            _activate_back[_programs(where.size)](
+                *arrays, of_hidden, of_raw, *numbers, where.each, width, *flags, *sizes
+            )
+        return of_hidden, of_raw if colored else None, None, None, None
 
 
 @triton.jit
