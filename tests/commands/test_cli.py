@@ -62,7 +62,7 @@ def compositions(monkeypatch):
 def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_users(
     compositions, tmp_path, monkeypatch, capsys, more, times
 ):
-    arguments = ["table", f"paths.output_dir={tmp_path}", f"runs=[{tmp_path}]", *more]
+    arguments = ["report", f"paths.output_dir={tmp_path}", f"run={tmp_path}", *more]
     monkeypatch.setattr(sys, "argv", ["nerf", *(each.format(tmp_path) for each in arguments)])
     with pytest.raises(SystemExit):
         cli.main()

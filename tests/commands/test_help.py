@@ -48,7 +48,6 @@ def test_the_help_of_a_setting_or_a_part_tells_values_meanings_and_what_they_tak
         ("foggy", "\n  * Fog disappears last"),
         ("crash", "Training stopped, crashed, or was killed"),
         ("ssh", "ssh -L 8080:127.0.0.1:8080 MACHINE"),
-        ("compare runs", "nerf table  "),
         ("film", "nerf render  "),
         ("blurry", "Blurred"),
         ("gray", "The picture is gray"),

@@ -197,7 +197,7 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
     ("command", "override", "kind"),
     [
         ("report", "max_megabytes=many", "a number"),
-        ("table", "force=3", "true or false"),
+        ("doctor", "json=3", "true or false"),
         ("train", "seed=null", "a number"),
         ("poses", "max_image_size=true", "a number"),
     ],

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from support.scenes import ball_scene
 from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
-from nerf_lightning.commands import report, table
+from nerf_lightning.commands import report
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.pixels.picture_files import image_size, read_rgba
@@ -73,6 +74,8 @@ def write_run(folder):
 
 
 def tabled(folder):
+    from nerf_lightning.extensions.table.commands import table
+
     table.run(composed("table", f"runs={folder / 'runs'}", f"paths.output_dir={folder / 'out'}", "force=true"))
     assert "<script" not in (folder / "out" / "table.md").read_text()
 
@@ -148,7 +151,6 @@ KINDS = {
     "keyframes": Kind(
         lambda f: (f / "keys.yaml").write_text(yaml.safe_dump({"keyframes": KEYFRAMES})), filmed, ("keys.yaml",)
     ),
-    "table": Kind(write_run, tabled, (*OF_A_RUN, "runs/a/.hydra/overrides.yaml")),
     "report": Kind(write_run, reported, (*OF_A_RUN, "runs/a/.hydra/config.yaml")),
     "resumed run": Kind(
         write_run, lambda f: tame(former_overrides(f / "runs" / "a", [])), ("runs/a/.hydra/overrides.yaml",)
@@ -160,6 +162,8 @@ KINDS = {
     ),
     "events": Kind(write_events, lambda f: curve_drawings(read_curves(f)), ("events.out.tfevents.1",), 15),
 }
+if find_spec("nerf_lightning.extensions"):
+    KINDS["table"] = Kind(write_run, tabled, (*OF_A_RUN, "runs/a/.hydra/overrides.yaml"))
 
 
 @pytest.fixture(autouse=True)
