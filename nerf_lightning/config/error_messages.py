@@ -1,4 +1,4 @@
-"""Hydra's and OmegaConf's errors as one paragraph, with near matches for a mistyped key."""
+"""Errors as one paragraph: Hydra's and OmegaConf's, with near matches for a mistyped key; out of memory; a GPU's."""
 
 import os
 import re

@@ -52,7 +52,7 @@ def scene_overrides(path: str) -> list[str]:
 
 
 def _settings_of(file: Path) -> dict[str, Any]:
-    """Return the settings of one of our YAMLs, with those that it includes (`/capture_defaults@_here_`)."""
+    """Return the settings of one of our YAMLs, with those that it includes (`/scene_defaults@_here_`)."""
     content = yaml.safe_load(file.read_text(encoding="utf-8"))
     taken: dict[str, Any] = {}
     for name in content.pop("defaults", []):

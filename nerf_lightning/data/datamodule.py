@@ -13,6 +13,7 @@ from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_dev
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches, WholeViews
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.progress import Progress, batch_sizes
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
@@ -48,6 +49,8 @@ class RayDataModule(LightningDataModule):
         depth_every: one in `depth_every` rays passes through a pixel of known distance, as the loss requires; 0: none.
         views_per_step: take the rays of a step from this number of photographs, equally many of each, for models that
             render each photograph from others; None: from all.
+        candidates: pixels of which a ray shows one, more often where photographs have contrast, with a weight that
+            makes up for it; 1: all pixels alike. Ignored with `views_per_step` and losses that look at squares.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class RayDataModule(LightningDataModule):
         overfit_views: int | None = None,
         views_per_step: int | None = None,
         depth_every: int = 0,
+        candidates: int = 1,
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
@@ -80,6 +84,7 @@ class RayDataModule(LightningDataModule):
                 f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "
                 "processes without a ray. Raise them, or use fewer devices."
             )
+        require_ranges({"data.candidates": candidates}, {"data.candidates": (1, 64)})
         if sample_budget is not None and (sample_budget < 1 or crop_steps):
             raise InputError(
                 f"data.sample_budget={sample_budget} with data.crop_steps={crop_steps}: give a positive budget and no "
@@ -97,7 +102,7 @@ class RayDataModule(LightningDataModule):
             scene = _few_views(scene, overfit_views)
         _check_views_per_step(views_per_step, batch_rays, sample_budget, patch, depth_every)
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays, patch, views_per_step, depth_every)
+        self.batches = RayBatches(scene, progress, seed, batch_rays, patch, views_per_step, depth_every, candidates)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
         self.device_budget, self.prefetch = device_budget, prefetch

@@ -6,9 +6,10 @@ number of rays seen is stored, so a resumed run continues exactly where it stopp
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.compute import ranks
@@ -16,6 +17,7 @@ from nerf_lightning.data.depth_rays import DepthRays
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.contrast import choose
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.kernels.pixels.op import Domain, Order, has_kernel, ordered_batch
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
@@ -114,6 +116,8 @@ class RayBatches:
         views: number of photographs that the rays of a batch are from; None: all.
         depth_every: one in `depth_every` rays (or squares) passes through a pixel of known distance, if there are any;
             these come last in a batch. 0: none.
+        candidates: pixels of which a ray shows one, in proportion to local contrast (`nerf.contrast`); 1: all pixels
+            alike. Squares and rays of a few photographs have no candidates.
     """
 
     def __init__(
@@ -125,9 +129,10 @@ class RayBatches:
         patch: int = 1,
         views: int | None = None,
         depth_every: int = 0,
+        candidates: int = 1,
     ):
         self.progress, self.seed, self.batch_rays, self.patch, self.views = progress, seed, batch_rays, patch, views
-        self.depth_every = depth_every
+        self.depth_every, self.candidates = depth_every, candidates if patch == 1 and views is None else 1
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device for which a background thread makes batches; None: no such thread.
@@ -188,15 +193,17 @@ class RayBatches:
         """Return the batch after `rays_seen` rays of an attempt; `batch_rays` of None: the current batch size."""
         if self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device):
             return self._in_one_kernel(attempt, rays_seen, batch_rays)
-        pixels = self.pixels_at(attempt, rays_seen, batch_rays)
+        pixels, weight = self._drawn_at(attempt, rays_seen, batch_rays)
         batch = gather_batch(self.scene, pixels)
+        if weight is not None:
+            batch = replace(batch, weight=torch.cat([weight, batch.weight[len(weight) :]]))
         if self.depths is None:
             return batch
         return self.depths.with_depths(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
     def _in_one_kernel(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
         domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
-        rays = Order(places, len(domain), fold(self.seed, attempt, purpose))
+        rays = Order(places, len(domain), fold(self.seed, attempt, purpose), self.candidates)
         numbered = Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
         if self.depths is None:
             return ordered_batch(rays, numbered, self.scene.pixels)
@@ -206,20 +213,29 @@ class RayBatches:
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return this process's pixels of that batch."""
+        return self._drawn_at(attempt, rays_seen, batch_rays)[0]
+
+    def _drawn_at(
+        self, attempt: int, rays_seen: int, batch_rays: int | None
+    ) -> tuple[PixelIndex, Float[Tensor, "drawn"] | None]:
+        """Return the pixels, and the weights of those that were chosen from candidates, which come first."""
         domain, purpose, together, places = self._places_at(attempt, rays_seen, batch_rays)
         if self.views is not None:
             key = fold(self.seed, attempt, purpose)
             starts, sizes = domain.ends.cpu() - domain.sizes.cpu(), domain.sizes.cpu()
             mine, count = torch.arange(places.start, places.stop) - together.start, len(together)
             numbers = rays_of_few_views(starts, sizes, together.start // count, mine, count, self.views, key)
-            return domain.locate(sent(numbers, domain.ends.device))
+            return domain.locate(sent(numbers, domain.ends.device)), None
         shift: Tensor | int = 0
         if self.patch > 1:  # each epoch has its own grid of squares, so that no pixel is always at a border
             shift = sent(self._epoch_keys(places, len(domain), attempt, purpose) % self.patch, domain.ends.device)
-        pixels = domain.locate(self._in_order(places, len(domain), attempt, purpose), shift)
-        if self.depths is None:
-            return pixels
-        return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
+        every = range(places.start * self.candidates, places.stop * self.candidates)
+        pixels, weight = domain.locate(self._in_order(every, len(domain), attempt, purpose), shift), None
+        if self.candidates > 1:
+            pixels, weight = choose(self.scene.pixels, pixels, places, fold(self.seed, attempt, purpose))
+        if self.depths is not None:
+            pixels = concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
+        return pixels, weight
 
     def _places_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> tuple[PixelDomain, str, range, range]:
         """Return the domain of that batch, its name, and positions in its order: the whole batch's, this process's."""

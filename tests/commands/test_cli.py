@@ -25,7 +25,7 @@ def test_help_lists_every_command_with_its_line_and_fits_a_terminal(nerf, monkey
 
 def test_json_is_refused_without_a_table_and_what_readers_share_is_no_scene_and_no_command(nerf):
     said(nerf("train", "--json"), "nerf train prints no table", "such as nerf doctor")
-    assert "There is no command 'capture_defaults'" in nerf("capture_defaults").err
+    assert "There is no command 'scene_defaults'" in nerf("scene_defaults").err
     refused = nerf("train", "scene=capture").err
     assert "There is no scene=capture." in refused
     assert "colmap" in refused.partition("Its options are")[2]

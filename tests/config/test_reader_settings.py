@@ -26,7 +26,7 @@ class NewReader(CaptureReader):
 
 
 YAML = f"""\
-defaults: [/capture_defaults@_here_]
+defaults: [/scene_defaults@_here_]
 _target_: {__name__}.NewReader
 name: new
 """
@@ -45,7 +45,7 @@ def test_a_new_reader_of_three_lines_can_be_told_what_all_can(tmp_path):
 
 def test_the_yaml_has_the_settings_that_the_class_has():
     settings = {each.name: "???" if each.default is MISSING else each.default for each in fields(CaptureReader)}
-    assert OmegaConf.load(conf_folder() / "capture_defaults.yaml") == settings
+    assert OmegaConf.load(conf_folder() / "scene_defaults.yaml") == settings
 
 
 def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path):

@@ -7,7 +7,9 @@ from support.scenes import ball_scene
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.contrast import FLAT, shares
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import PixelIndex
 
 
 def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
@@ -159,3 +161,38 @@ def test_squares_that_fit_no_picture_or_no_batch_are_refused_with_a_cure_and_the
         RayDataModule(ball_scene(), Progress(), 0, batch_rays=256, patch=16)
     with pytest.raises(InputError, match=r"data\.batch_rays=100 is not a multiple .* data\.batch_rays=96"):
         RayDataModule(ball_scene(), Progress(), 0, batch_rays=100, patch=4)
+
+
+def test_rays_prefer_contrast_and_weigh_less_there():
+    scene = ball_scene()
+    colors = scene.pixels.rgba.float()[:432, 0]  # of the three training views
+    loader = RayBatches(scene, Progress(), 0, 432, candidates=4)
+    drawn = [loader.batch_at(0, 432 * number) for number in range(100)]
+    number = torch.cat([flat(scene, batch.pixels) for batch in drawn])
+    weight = torch.cat([batch.weight for batch in drawn])
+    every = PixelIndex(*(torch.cat([getattr(batch.pixels, axis) for batch in drawn]) for axis in ("view", "x", "y")))
+    edges = shares(scene.pixels, every) > 10 * FLAT
+    assert float(edges.float().mean()) > 1.5 * float((weight * edges).mean())
+    # Weighted, it is as if pixels were drawn evenly: 43,200 colors of a standard deviation below 128.
+    assert float((weight * colors[number]).mean()) == pytest.approx(float(colors.mean()), abs=4 * 128 / 43_200**0.5)
+    assert float(weight.mean()) == pytest.approx(1.0, abs=0.02)
+    counts = number.bincount(minlength=432)
+    assert int(counts.min()) > 0
+
+
+def test_one_place_has_one_ray_whatever_the_batch_and_masked_pixels_are_a_last_resort():
+    scene = ball_scene()
+    mask = (torch.arange(len(scene.pixels.rgba)) % 2).to(torch.uint8)
+    scene = replace(scene, pixels=replace(scene.pixels, mask=mask))
+    loader = RayBatches(scene, Progress(), 0, 64, candidates=3)
+    whole, half = loader.batch_at(1, 128, 64), loader.batch_at(1, 160, 32)
+    assert all(torch.equal(one[32:], other) for one, other in zip(whole.tensors(), half.tensors(), strict=True))
+    kept = mask[flat(scene, whole.pixels)] > 0
+    assert torch.equal(kept, whole.weight > 0)
+    assert float(kept.float().mean()) > 0.75  # 7 of 8, on average: half of evenly drawn ones
+
+
+def test_equal_pixels_are_drawn_alike():
+    scene = ball_scene()
+    scene = replace(scene, pixels=replace(scene.pixels, rgba=torch.full_like(scene.pixels.rgba, 99)))
+    assert bool((RayBatches(scene, Progress(), 0, 64, candidates=4).batch_at(0, 0).weight == 1).all())

@@ -42,7 +42,7 @@ def _composed(command: str, overrides: tuple[str, ...]) -> DictConfig:
 
 
 def loaded(group: str, option: str) -> DictConfig:
-    """Return one yaml as it stands, with the settings that it includes (`/capture_defaults@_here_`)."""
+    """Return one yaml as it stands, with the settings that it includes (`/scene_defaults@_here_`)."""
     config = OmegaConf.load(conf_file(f"{group}/{option}"))
     for base in [str(each) for each in config.get("defaults", []) if str(each).endswith("@_here_")]:
         config.defaults.remove(base)

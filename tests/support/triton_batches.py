@@ -1,5 +1,6 @@
 """The triton kernels that make batches and rays against their references."""
 
+from itertools import product
 from types import SimpleNamespace
 from unittest.mock import patch
 
@@ -24,23 +25,24 @@ def check_pixels(kernels, device, generator, rays):
     known = PixelIndex(view, width[view] - 1, height[view] - 1)
     depths = KnownDepths(known, *torch.rand(2, 5, generator=generator))
 
-    def batches(place, masked, every):
+    def batches(place, masked, every, candidates):
         arrays = (each.to(place) for each in (rgba, sizes.cumsum(0) - sizes, width, height))
         store = PixelStore(*arrays, True, mask.to(torch.uint8).to(place) if masked else None)
         scene = SimpleNamespace(pixels=store, splits={"train": (3, 0, 2)}, depths=depths)
-        made = RayBatches(scene, Progress(), 3, rays, depth_every=every)
+        made = RayBatches(scene, Progress(), 3, rays, depth_every=every, candidates=candidates)
         made.crop_to(0.5, 2, 2)
         return made
 
-    for masked, every, attempt, seen in ((False, 0, 0, 0), (True, 8, 1, 33 * rays), (True, 3, 0, (1 << 33) + 5)):
-        expected = batches("cpu", masked, every).batch_at(attempt, seen)
+    places = (False, 0, 0, 0), (True, 8, 1, 33 * rays), (True, 3, 0, (1 << 33) + 5)
+    for (masked, every, attempt, seen), candidates in product(places, (1, 3)):
+        expected = batches("cpu", masked, every, candidates).batch_at(attempt, seen)
         with patch.object(op, "cuda_backend", lambda *given: kernels):
-            found = batches(device, masked, every).batch_at(attempt, seen)
+            found = batches(device, masked, every, candidates).batch_at(attempt, seen)
         assert len(found.tensors()) == (7 if every else 5)
         for one, other in zip(found.tensors(), expected.tensors(), strict=True):
             assert torch.equal(one.cpu(), other)
     with patch.object(op, "cuda_backend", lambda *given: kernels):
-        assert batches(device, True, 0).batch_at(0, 0, 0).num_rays == 0
+        assert batches(device, True, 0, 3).batch_at(0, 0, 0).num_rays == 0
 
 
 def check_rays(kernels, device, generator, rays):

@@ -1,6 +1,7 @@
 """How much memory a run takes at most: said before it starts, with what to lower.
 
-Where it runs out, `training/gradients/tiles.py` takes smaller tiles.
+Where it runs out, `training/gradients/tiles.py` takes smaller tiles. How much of a GPU the pixels may take is decided
+in `data/pixels/placement.py`.
 """
 
 import logging
@@ -17,7 +18,7 @@ from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
 # A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
-# rows as a rule (products.py: pad_rows), and kept: 0.7 MB each.
+# rows as a rule (`matmul_precision.pad_rows`), and kept: 0.7 MB each.
 COMPILED_PER_MATRIX = 3 * 2 * 700_000
 # Bytes per ray, per pixel, and per point beside its features, each of which is kept a few times over.
 RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 128, 1_024, 6

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.extensions.table.rows import HIGH_FIRST, PLAIN, SPREAD
+from nerf_lightning.extensions.table.columns import HIGH_FIRST, PLAIN, SPREAD
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.runs.table_cells import Row, shown_columns
 

@@ -5,9 +5,9 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
+from nerf_lightning.extensions.table.columns import ORDERS, result_table
 from nerf_lightning.extensions.table.find_results import find_results
 from nerf_lightning.extensions.table.latex import write_latex
-from nerf_lightning.extensions.table.rows import ORDERS, result_table
 from nerf_lightning.files.html import write_page
 from nerf_lightning.files.json_files import print_json
 from nerf_lightning.messages.console import say, say_written

@@ -9,9 +9,10 @@ import torch
 import triton
 import triton.language as tl
 
+from nerf_lightning.nerf.contrast import FLAT
 from nerf_lightning.nerf.kernels.pixels.op import NOWHERE, Domain, Order
 from nerf_lightning.nerf.kernels.random.cuda import mix
-from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
+from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, fold, grid_of
 from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
 
@@ -32,11 +33,12 @@ def batch(
         _batch[(triton.cdiv(count, BLOCK),)](
             *(view, x, y, rgba, weight, distance, certainty),
             *(several, rays.places.start, rays.size, rays.key, *grid_of(rays.size)),
+            fold(rays.key, "contrast"),
             *(count, of_known.places.start, of_known.size, of_known.key, *grid_of(of_known.size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
-            *(store.offset, store.width, store.rgba, store.mask),
+            *(store.offset, store.width, store.height, store.rgba, store.mask),
             *([None] * 5 if depths is None else depths.tensors()),
-            FEISTEL_ROUNDS,
+            *(rays.candidates, FLAT, FEISTEL_ROUNDS),
             BLOCK,
         )
     return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
@@ -59,31 +61,16 @@ def trial(device: str = "cuda") -> None:
         raise RuntimeError("a trial of its kernels gave wrong pixels")
 
 
-VARIES = ["several", "first", "key", "count", "known_first", "known_key"]
+VARIES = ["several", "first", "key", "chooser", "count", "known_first", "known_key"]
 """Arguments that vary between steps, without recompiling."""
 
 
-@triton.jit(do_not_specialize=VARIES)
+@triton.jit
 @no_type_check
-def _batch(
-    out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
-    several, first, size, key, rows, columns,
-    count, known_first, known_size, known_key, known_rows, known_columns,
-    ends, across, views, left, top, slots, steps,
-    offset, width, rgba, mask,
-    known_view, known_x, known_y, known_distance, known_certainty,
-    rounds: tl.constexpr, block: tl.constexpr,
-):  # fmt: skip
-    index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
-    valid, is_known = index < count, index >= several
-    # As `randomness.permute`.
-    size = tl.where(is_known, known_size, size).to(tl.int64)
-    rows = tl.where(is_known, known_rows, rows).to(tl.int64)
-    columns = tl.where(is_known, known_columns, columns).to(tl.int64)
-    place = tl.where(is_known, index - several + known_first, index + first)
+def _number(place, size, rows, columns, key, valid, rounds: tl.constexpr):
+    """Return what is at places of the order (`randomness.permute`)."""
     epoch = place // size
     number = place - epoch * size
-    key = tl.where(is_known, known_key, key).to(tl.uint32)
     start = mix(key ^ mix(epoch.to(tl.uint32)) ^ 0x5A5A5A5A)
     walks = valid
     while tl.max(walks.to(tl.int32), axis=0) > 0:
@@ -97,20 +84,91 @@ def _batch(
                 row = (row + mix(word ^ column.to(tl.uint32)).to(tl.int64)) % rows
         number = tl.where(walks, row * columns + column, number)
         walks = walks & (number >= size)
-    # Pixels of a domain: how many views end before each, by bisection.
-    numbered = valid & ~is_known
+    return number
+
+
+@triton.jit
+@no_type_check
+def _pixel(number, ends, across, views, left, top, slots, steps, valid, block: tl.constexpr):
+    """Return view, x and y of numbers of a domain: how many views end before each, by bisection."""
     low, high = tl.zeros([block], tl.int32), tl.full([block], slots, tl.int32)
     for _ in range(steps):
         middle = (low + high) // 2
-        open = numbered & (low < high)
+        open = valid & (low < high)
         beyond = open & (tl.load(ends + middle, mask=open, other=0) <= number)
         high = tl.where(open & ~beyond, middle, high)
         low = tl.where(beyond, middle + 1, low)
-    within = number - tl.load(ends + low - 1, mask=numbered & (low > 0), other=0)
-    side = tl.load(across + low, mask=numbered, other=1)
-    view = tl.load(views + low, mask=numbered, other=0)
-    x = within % side + tl.load(left + low, mask=numbered, other=0)
-    y = within // side + tl.load(top + low, mask=numbered, other=0)
+    within = number - tl.load(ends + low - 1, mask=valid & (low > 0), other=0)
+    side = tl.load(across + low, mask=valid, other=1)
+    x = within % side + tl.load(left + low, mask=valid, other=0)
+    return tl.load(views + low, mask=valid, other=0), x, within // side + tl.load(top + low, mask=valid, other=0)
+
+
+@triton.jit
+@no_type_check
+def _color(rgba, flat, valid):
+    """Return colors times alpha, and 255 times alpha."""
+    channel, inside = tl.arange(0, 4)[None, :], valid[:, None]
+    color = tl.load(rgba + 4 * flat[:, None] + channel, mask=inside, other=0).to(tl.int32)
+    alpha = tl.load(rgba + 4 * flat + 3, mask=valid, other=0).to(tl.int32)[:, None]
+    return alpha * tl.where(channel == 3, 255, color)
+
+
+@triton.jit
+@no_type_check
+def _share(offset, width, height, rgba, mask, view, x, y, valid, flat_share: tl.constexpr):
+    """Return in proportion to what pixels are chosen (`nerf.contrast.shares`)."""
+    begin, across = tl.load(offset + view, mask=valid, other=0), tl.load(width + view, mask=valid, other=1)
+    down = tl.load(height + view, mask=valid, other=1)
+    here = begin + y * across + x
+    color = _color(rgba, here, valid)
+    change = tl.abs(_color(rgba, begin + y * across + tl.minimum(x + 1, across - 1), valid) - color)
+    change += tl.abs(_color(rgba, begin + y * across + tl.maximum(x - 1, 0), valid) - color)
+    change += tl.abs(_color(rgba, begin + tl.minimum(y + 1, down - 1) * across + x, valid) - color)
+    change += tl.abs(_color(rgba, begin + tl.maximum(y - 1, 0) * across + x, valid) - color)
+    share = (tl.max(change, axis=1) + flat_share).to(tl.int64)
+    if mask is not None:
+        share = share * tl.load(mask + here, mask=valid, other=0).to(tl.int64)
+    return share
+
+
+@triton.jit(do_not_specialize=VARIES)
+@no_type_check
+def _batch(
+    out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
+    several, first, size, key, rows, columns, chooser,
+    count, known_first, known_size, known_key, known_rows, known_columns,
+    ends, across, views, left, top, slots, steps,
+    offset, width, height, rgba, mask,
+    known_view, known_x, known_y, known_distance, known_certainty,
+    candidates: tl.constexpr, flat_share: tl.constexpr, rounds: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
+    valid, is_known = index < count, index >= several
+    # Rays have `candidates` places each, rays through pixels of known distance one.
+    size = tl.where(is_known, known_size, size).to(tl.int64)
+    rows = tl.where(is_known, known_rows, rows).to(tl.int64)
+    columns = tl.where(is_known, known_columns, columns).to(tl.int64)
+    key = tl.where(is_known, known_key, key).to(tl.uint32)
+    place = tl.where(is_known, index - several + known_first, (index + first) * candidates)
+    numbered = valid & ~is_known
+    number = _number(place, size, rows, columns, key, valid, rounds)
+    view, x, y = _pixel(number, ends, across, views, left, top, slots, steps, numbered, block)
+    kept = tl.full([block], 1.0, tl.float32)
+    if candidates > 1:
+        total = tl.zeros([block], tl.int64)
+        share = tl.zeros([block], tl.int64)
+        for each in range(candidates):
+            other = _number(place + each, size, rows, columns, key, numbered, rounds)
+            view_of, x_of, y_of = _pixel(other, ends, across, views, left, top, slots, steps, numbered, block)
+            own = _share(offset, width, height, rgba, mask, view_of, x_of, y_of, numbered, flat_share)
+            total += own
+            word = mix((place + each).to(tl.uint32) ^ chooser.to(tl.uint32))
+            taken = numbered & ((word >> 8).to(tl.int64) * total < (own << 24))
+            view, x, y = tl.where(taken, view_of, view), tl.where(taken, x_of, x), tl.where(taken, y_of, y)
+            share = tl.where(taken, own, share)
+        ratio = tl.div_rn(total.to(tl.float32), tl.maximum(candidates * share, 1).to(tl.float32))
+        kept = tl.where(is_known, kept, ratio)
     if known_view is not None:
         told = valid & is_known
         view = tl.where(told, tl.load(known_view + number, mask=told, other=0), view)
@@ -124,9 +182,9 @@ def _batch(
     channel, inside = tl.arange(0, 4)[None, :], valid[:, None]
     color = tl.load(rgba + 4 * flat[:, None] + channel, mask=inside, other=0).to(tl.float32)
     tl.store(colors + 4 * index[:, None] + channel, tl.div_rn(color, 255.0), mask=inside)
-    kept = tl.full([block], 1.0, tl.float32)
     if mask is not None:
-        kept = tl.load(mask + flat, mask=valid, other=0).to(tl.float32)
+        seen = tl.load(mask + flat, mask=valid, other=0).to(tl.float32)
+        kept = kept * seen
     tl.store(weight + index, kept, mask=valid)
     if known_view is not None:
         tl.store(out_distance + index, tl.load(known_distance + number, mask=told, other=1.0), mask=valid)

@@ -19,6 +19,8 @@ class Order(NamedTuple):
     """Size of an epoch, whose order is `randomness.permute` with the key `fold(*parts, epoch)`."""
     key: int
     """fold(*parts)."""
+    candidates: int = 1
+    """Numbers of the sequence for each place, of which contrast chooses one (`nerf.contrast.choose`)."""
 
 
 class Domain(NamedTuple):

@@ -1,4 +1,4 @@
-"""Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
+"""Columns of measured runs in one table: a row per scene, model and setting, mean and standard deviation over seeds."""
 
 import statistics
 from collections.abc import Sequence
