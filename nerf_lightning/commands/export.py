@@ -105,10 +105,11 @@ def run_context(
     """Return what is known about a checkpoint's run: its photographs, its metrics, and a camera path."""
     checkpoint = opened.checkpoint
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
+    # A page is drawn by the browser, whatever time the model takes.
+    metrics = read_json_object(run / "metrics.json") | {"frames_per_second": None}
     known = [
         ("model", checkpoint.choices.get("model", "")),
-        ("step", f"{checkpoint.step:,}"),
-        *facts(read_json_object(run / "metrics.json"), read_note(run)),
+        *facts(metrics, read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None

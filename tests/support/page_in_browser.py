@@ -34,6 +34,12 @@ def press(driver, key: str) -> None:
     driver.execute_script(f"document.body.dispatchEvent({event})", key)
 
 
+def name_it(driver, text: str) -> None:
+    """Answer the page's form that asks for a name."""
+    form = "document.querySelector('#naming form').requestSubmit(document.querySelector('#naming [value=save]'))"
+    driver.execute_script(f"document.getElementById('name').value = arguments[0]; {form}", text)
+
+
 def hide_controls(driver) -> None:
     """Let the scene have the whole window."""
     press(driver, "h")
@@ -49,8 +55,7 @@ def drawn(page, view: int, width: int, height: int, behind=1.0) -> np.ndarray:
 
 def drawn_through(page, c2w, focal, size, width, height, behind=1.0) -> np.ndarray:
     about, splats = read_page(page)
-    small, large = sorted((width / size[0], height / size[1]))
-    scale = small * (large / small) ** (1 / 3 if about["unbounded"] else 0)
+    scale = min(width / size[0], height / size[1])
     camera = Pinhole.of(pinhole_cameras(c2w[None].float(), scale * float(focal), width, height), 0, about["near"])
     dilation = gaussians.DILATION * max(1.0, scale * float(focal) / about["focal"]) ** 2
     with mock.patch.object(gaussians, "DILATION", dilation):

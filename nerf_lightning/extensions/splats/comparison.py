@@ -28,6 +28,11 @@ class Comparison:
     panels: list[tuple[str, Tensor]]
     """Pictures of the first view, by name."""
 
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the metrics of splats and field in one row each, with its label."""
+        rows = [("quality", self.splats, f" on {self.views}"), ("the model's", self.field, ", without lens distortion")]
+        return [(label, f"PSNR {row['psnr']:.2f} dB{_ssim(row)}{how}") for label, row, how in rows if row is not None]
+
     def psnr(self) -> str:
         """Return a summary for the user."""
         said = f"{self.splats['psnr']:.2f} dB on {self.views}"
@@ -36,6 +41,10 @@ class Comparison:
         said += f"; the model, compared in the same way (without lens distortion): {self.field['psnr']:.2f} dB"
         ssim = "" if self.field["ssim"] is None else f"; SSIM {self.splats['ssim']:.3f} and {self.field['ssim']:.3f}"
         return said + ssim
+
+
+def _ssim(metrics: dict[str, Any]) -> str:
+    return "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.3f}"
 
 
 def compared(

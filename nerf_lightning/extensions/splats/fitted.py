@@ -1,5 +1,6 @@
 """Fit splats to a trained field and its photographs: the base of splat exports."""
 
+import logging
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -9,8 +10,9 @@ import torch
 from nerf_lightning.export.base import Export, Neutral, Report, RunContext, require_kernels, require_setting
 from nerf_lightning.extensions.splats.fit import Fitting, fit
 from nerf_lightning.extensions.splats.gaussians import Gaussians
-from nerf_lightning.extensions.splats.initialize import initial_gaussians, look_around
+from nerf_lightning.extensions.splats.initialize import COUNT, initial_gaussians, look_around
 from nerf_lightning.extensions.splats.views import View, photographed, without_lens
+from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.panoramas import faces_of_panoramas
 from nerf_lightning.nerf.models.base import Model
@@ -21,7 +23,8 @@ ROOM = "nerf_lightning.extensions.splats"
 KERNELS = (f"{ROOM}.projection", f"{ROOM}.tiles")
 PER_SIDE, MOST = 200, 150_000
 MOST_SHOWN = 3_000_000  # 500 MB as PLY.
-STAGES = {"surfaces": 15.0, "comparing": 5.0}
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,8 @@ class SplatFitting(Export):
         require_setting("max_views", self.max_views, self.max_views >= 0, "give 0 or more.")
 
     def stages(self) -> dict[str, float]:
-        """Return the approximate seconds of each stage."""
-        return STAGES | {"fitting": self.seconds}
+        """Return the approximate seconds of each stage, in their order."""
+        return {"surfaces": 60.0, "fitting": self.seconds, "comparing": 4.0 * self.max_views}
 
     def fitted(
         self, model: Model, record: SceneRecord, run: RunContext, tile_points: int, report: Report
@@ -86,6 +89,9 @@ class SplatFitting(Export):
         scene = record if photographs is None else photographs
         pinholes = without_lens(scene.cameras, self.longest)
         budget = self._budget(pinholes)
+        compared = f", and the model is rendered in up to {self.max_views} views to compare" if self.max_views else ""
+        steps = f"{COUNT} renders of the model, then {spoken(self.seconds)} of fitting (what.seconds){compared}"
+        log.info("splats: %s", steps)
         around = look_around(model, record, tile_points, self.seed, report)
         first = max(1, budget // 2) if self.seconds else budget
         gaussians = initial_gaussians(around, first, self.sh_degree, self.seed, run.min_opacity)

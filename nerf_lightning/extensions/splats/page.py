@@ -64,19 +64,21 @@ class PageExport(SplatFitting):
         marks = self._marks(record, folder)
         with StageProgress(self.stages()) as report:
             found = self.fitted(model, record, run, tile_points, report)
-            splats, facts = QuantizedSplats.of(found.gaussians), []
+            splats, facts, said = QuantizedSplats.of(found.gaussians), [], []
             if self.max_views:
                 chosen = record.background, self.max_views, tile_points
-                psnr = compared(found, splats.gaussians(), model, *chosen, report).psnr()
-                facts = [("PSNR", f"{psnr}{'' if run.crop is None else ' (of the whole scene)'}")]
+                comparison = compared(found, splats.gaussians(), model, *chosen, report)
+                part = "" if run.crop is None else " (of the whole scene)"
+                facts = [(label, f"{fact}{part}") for label, fact in comparison.facts()]
+                said = [("PSNR", f"{comparison.psnr()}{part}")]
             splats = splats if run.crop is None else QuantizedSplats.of(cropped(found.gaussians, run))
-        known = [*facts, ("splats", f"{splats.splats:,}, fitted to {found.truth} for {self.seconds:g} s")]
+        fit = ("splats", f"{splats.splats:,}, fitted to {found.truth} for {self.seconds:g} s")
         chosen_texts = marks, self.title, self.first_view
-        write_page(target, splats, found.focal, record, run, self.photographs, known, *chosen_texts)
+        write_page(target, splats, found.focal, record, run, self.photographs, [*facts, fit], *chosen_texts)
         if self.views is not None:
             write_json(folder / MARKS, marks)
         size = ("size", f"{target.stat().st_size / 1e6:.1f} MB")
-        say(*(f"{f'page {name}':<12} {fact}" for name, fact in [size, *known]))
+        say(*(f"{f'page {name}':<12} {fact}" for name, fact in [size, *said, fit]))
         return [target]
 
     def _marks(self, record: SceneRecord, folder: Path) -> Marks:
@@ -84,7 +86,7 @@ class PageExport(SplatFitting):
         path = kept if self.views is None else Path(self.views).expanduser()
         if self.views is not None and not path.is_file():
             raise InputError(
-                f'what.views={self.views}: there is no such file. The page\'s button "save as json" saves one.'
+                f'what.views={self.views}: there is no such file. The page\'s button "Download views" saves one.'
             )
         marks = read_marks(path if path.is_file() else None, record)
         names = [view["name"] for view in marks["views"]]

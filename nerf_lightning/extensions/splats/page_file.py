@@ -37,8 +37,9 @@ SHADERS = ("splats.vert", "splats.frag")
 NEAR_NDC = 0.2  # Share of the distance at which content begins.
 INSIDE = 0.01  # Share of the splats beyond either side of the box around which the view orbits.
 BACKGROUND_COLORS: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
-STILL, PHOTOGRAPH = 640, 320  # Longer side in pixels of the still picture, and of photographs.
-JPEG_QUALITY = 80
+# Longer side in pixels of the still picture, and of photographs, which are compared with the scene.
+STILL, PHOTOGRAPH = 640, 800
+QUALITY = 80  # Of WebP.
 DEPTH_COLORS = 17  # Straight lines between these follow the report's scale.
 PART_OF_PANORAMA = 1.5  # Field of view around a panorama's direction, in radians.
 # With a wider gap, cameras do not surround the scene: the page then sways, at most this far to either side.
@@ -103,9 +104,12 @@ def write_page(
     }
     page = {
         "title": title or run.name or record.name,
-        "facts": [("This page", facts), ("Model (test views)" if record.splits.get("test") else "Model", run.facts)],
+        "facts": [
+            ("This page", facts),
+            ("Model (test views, lens distortion included)" if record.splits.get("test") else "Model", run.facts),
+        ],
         "views": [_view(record, run, view if max_photographs else None) for view in views],
-        "still": _jpeg(_still(shown, record, first), STILL),
+        "still": _webp(_still(shown, record, first), STILL),
         "background": BACKGROUND_COLORS[at_evaluation(record.background)],
     }
     style, vertices, pixels, *scripts = (
@@ -174,12 +178,12 @@ def _view(record: SceneRecord, run: RunContext, view: int | None) -> ViewOnPage:
     # A panorama would not match what is seen from its position.
     if scene is None or name not in scene.view_names or record.cameras.lens_model == "equirectangular":
         return ViewOnPage(name, "")
-    return ViewOnPage(name, _jpeg(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))
+    return ViewOnPage(name, _webp(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))
 
 
-def _jpeg(picture: Float[Tensor, "height width 3"], longest: int) -> str:
+def _webp(picture: Float[Tensor, "height width 3"], longest: int) -> str:
     image = Image.fromarray(to_bytes(torch.as_tensor(picture)).contiguous().numpy())
     image.thumbnail((longest, longest))
     content = io.BytesIO()
-    image.save(content, format="JPEG", quality=JPEG_QUALITY)
-    return data_address("image/jpeg", content.getvalue())
+    image.save(content, format="WEBP", quality=QUALITY)
+    return data_address("image/webp", content.getvalue())

@@ -1,12 +1,13 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
-const MIDDLE = matchMedia("(pointer: coarse)").matches ? "" : ", or press Enter for the middle";
+const TOUCH = matchMedia("(pointer: coarse)").matches, TAP_ON = TOUCH ? "Tap" : "Click";
+const MIDDLE = TOUCH ? "" : ", or press Enter for the middle";
 const NARROW = matchMedia("(max-width: 700px)"), TOLD = 6000;  // milliseconds that a result stays
 const GAP = 4;  // pixels between labels
 const ASKS = {
-  note: `Tap the place that the note is about${MIDDLE}.`,
-  distance: `Tap the first point${MIDDLE}.`,
-  second: `Tap the second point${MIDDLE}.`,
+  note: `${TAP_ON} the place that the note is about${MIDDLE}.`,
+  distance: `${TAP_ON} the first point${MIDDLE}.`,
+  second: `${TAP_ON} the second point${MIDDLE}.`,
 };
 
 class Marks {
@@ -26,10 +27,11 @@ class Marks {
     this.changed();
   }
 
-  addView() {
+  async addView() {
     const picture = document.querySelector("#photographs button[aria-pressed=true]");
-    const name = prompt("Name of this view", picture === null ? `view ${this.lists.views.length + 1}` : picture.title);
-    if (name) this.add("views", { name: this.unique("views", "name", name), ...this.path.cameraOf(this.frames.view) });
+    const camera = this.path.cameraOf(this.frames.view);
+    const name = await asked("Name of this view", picture === null ? `view ${this.lists.views.length + 1}` : picture.title);
+    if (name) this.add("views", { name: this.unique("views", "name", name), ...camera });
   }
 
   show(view) {
@@ -47,12 +49,18 @@ class Marks {
     byId("scene").focus();  // where Enter stands for the middle
   }
 
-  tap(x, y) {
+  // The middle of what is shown between the bars.
+  tapMiddle() {
+    const { top, width, height } = shownPart();
+    this.tap(width / 2, top + height / 2);
+  }
+
+  async tap(x, y) {
     if (this.asks === null) return;
     const { view, picture } = this.frames, away = picture.depth(view, x, y);
     picture.draw(view, 1);
     if (!away) {
-      byId("told").textContent = "There is nothing here. Tap a surface.";
+      byId("told").textContent = `There is nothing here. ${TAP_ON} a surface.`;
       return;
     }
     const { focal, center } = lensIn(view);
@@ -60,7 +68,7 @@ class Marks {
     const point = this.path.toUser(view.axes.reduce((sum, axis, i) => plus(sum, axis, away * ray[i]), view.eye));
     if (this.asks === "note") {
       this.begin(null);
-      const text = prompt("Note");
+      const text = await asked("Note", "");
       if (text) this.add("notes", { text: this.unique("notes", "text", text), position: point });
     } else if (this.asks === "distance") {
       this.first = point;
@@ -68,7 +76,8 @@ class Marks {
     } else {
       this.begin(null);
       this.add("distances", { from: this.first, to: point });
-      byId("told").textContent = this.told(this.lists.distances.at(-1));
+      const said = this.metres === null ? " in the capture's own units, whose length is not known" : "";
+      byId("told").textContent = this.told(this.lists.distances.at(-1)) + said;
       clearTimeout(this.passing);
       this.passing = setTimeout(() => this.forget(), TOLD);
     }
@@ -99,7 +108,7 @@ class Marks {
 
   told({ from, to }) {
     const units = length(minus(to, from));
-    return this.metres === null ? `${units.toPrecision(3)} units` : `${(units * this.metres).toPrecision(3)} m`;
+    return this.metres === null ? units.toPrecision(3) : `${(units * this.metres).toPrecision(3)} m`;
   }
 
   changed() {
@@ -117,11 +126,11 @@ class Marks {
     const { views, notes, distances } = this.lists;
     byId("views").replaceChildren(...views.map((view) => button(view, view.name, "", () => this.show(view))));
     const pins = [
-      ...notes.map((note) => [note, note.text, "note", [note.position]]),
       ...distances.map((distance) => [distance, this.told(distance), "distance", [distance.from, distance.to]]),
+      ...notes.map((note) => [note, note.text, "note", [note.position]]),
     ];
     this.drawn = pins.map(([mark, text, name, points]) => {
-      const line = document.createElementNS("http://www.w3.org/2000/svg", "line");
+      const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
       return { made: button(mark, text, name, () => {}), line, points: points.map((point) => this.path.fromUser(point)) };
     });
     byId("pins").replaceChildren(...this.drawn.map(({ made }) => made));
@@ -144,7 +153,7 @@ class Marks {
       made.hidden = seen.includes(null);
       line.style.visibility = made.hidden ? "hidden" : "visible";
       if (made.hidden) continue;
-      const [from, to] = [[...seen[0]], [...seen.at(-1)]], [x, y] = plus(from, to).map((each) => each / 2);
+      const [from, to] = [seen[0], seen.at(-1)], [x, y] = plus(from, to).map((each) => each / 2);
       const box = { x, top: y, width: made.offsetWidth, height: made.offsetHeight + GAP };
       for (const other of boxes.sort((a, b) => a.top - b.top)) {
         const beside = x >= other.x + other.width || other.x >= x + box.width;
@@ -154,12 +163,25 @@ class Marks {
       const down = box.top - y;
       made.style.transform = `translate(${x}px, ${box.top}px)`;
       made.style.setProperty("--down", `${down}px`);
-      if (points.length === 1) to[1] += down;  // a line from the point to its label
-      for (const [name, at] of Object.entries({ x1: from[0], y1: from[1], x2: to[0], y2: to[1] })) line.setAttribute(name, at);
+      line.setAttribute("d", `M ${from} L ${to} M ${x} ${y} v ${down}`);  // and down to a label that had to give way
       if (points.length > 1) continue;
       const away = picture.depth(view, x, y);
       const behind = away > 0 && away < 0.95 * length(minus(points[0], view.eye));
       for (const drawn of [made, line]) drawn.classList.toggle("behind", behind);
     }
   }
+}
+
+// What a person types into the page's own form; null: nothing.
+function asked(question, value) {
+  const [dialog, name] = ["naming", "name"].map(byId);
+  byId("asked").textContent = question;
+  name.value = value;
+  byId("cancel").onclick = () => dialog.close("");
+  dialog.returnValue = "";
+  dialog.showModal();
+  name.select();
+  return new Promise((found) => {
+    dialog.onclose = () => found(dialog.returnValue === "save" ? name.value : null);
+  });
 }

@@ -45,16 +45,17 @@ async function readScene(about) {
 
 // ---- The lens ----------------------------------------------------------------------------------------------------
 
-// Width and height of the part of the window (in pixels of CSS) above the strip of photographs, which would hide it.
-const shownPart = () => [innerWidth, innerHeight - document.querySelector("footer").offsetHeight];
+// Top, width and height of the part of the window (in pixels of CSS) between the bars, which would hide it.
+function shownPart() {
+  const [above, below] = ["header", "footer"].map((name) => document.querySelector(name).offsetHeight);
+  return { top: above, width: innerWidth, height: Math.max(1, innerHeight - above - below) };
+}
 
 // Focal length and principal point of a view's lens, whose picture fits into that part of the window, in `ratio` pixels
-// to one of CSS. Of scenes without bounds, where nothing is known beyond the photographs' edges, it fills a part of what
-// would stay empty.
-function lensIn({ lens, about }, ratio = 1) {
-  const [width, height] = shownPart().map((side) => ratio * side), middle = [width / 2, height / 2];
-  const fits = [width / lens.width, height / lens.height], least = Math.min(...fits);
-  const scale = about.unbounded ? least * Math.cbrt(Math.max(...fits) / least) : least;
+// to one of CSS.
+function lensIn({ lens }, ratio = 1) {
+  const { top, width, height } = shownPart(), middle = [ratio * width / 2, ratio * (top + height / 2)];
+  const scale = ratio * Math.min(width / lens.width, height / lens.height);
   const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
   return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
 }
@@ -189,10 +190,12 @@ class Frames {
       if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
       this.drawing = true;
       this.picture.draw(this.view, this.share);
+      tellDepths(this);
       this.ask();
     } else {
       this.drawing = false;
       this.picture.draw(this.view, 1);
+      tellDepths(this);
       document.body.dataset.state = "still";
     }
   }
@@ -213,13 +216,11 @@ function fly(frames, seconds) {
 }
 
 // The photograph lies over what its camera shows. Until somebody moves, scenes without bounds, where nothing may be known
-// outside of its frame, are dark there.
+// outside of its frame, are dark there; but not their depths, whose colors have a scale.
 function place({ view, turning }) {
-  const [photograph, seam, around] = ["photograph", "seam", "around"].map(byId), source = sourceOf(view.photograph);
-  document.body.classList.toggle("framed", view.about.unbounded && (turning || view.photograph !== null));
-  const share = Number(byId("wipe").value) / 100;
-  photograph.hidden = byId("wiping").hidden = !source;
-  seam.hidden = !source || share === 0 || share === 1;
+  const [frame, photograph, around] = ["frame", "photograph", "around"].map(byId), source = sourceOf(view.photograph);
+  document.body.classList.toggle("framed", view.about.unbounded && view.shown === 0 && (turning || view.photograph !== null));
+  frame.hidden = !source;
   for (const button of document.querySelectorAll("#photographs button")) {
     button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
   }
@@ -227,11 +228,21 @@ function place({ view, turning }) {
   const box = { width: scale * lens.width, height: scale * lens.height, left, top };
   const edges = { left, top, right: left + box.width, bottom: top + box.height };
   for (const [name, pixels] of Object.entries(edges)) around.style.setProperty(`--${name}`, `${pixels}px`);
-  if (!source) return;
-  for (const [name, pixels] of Object.entries(box)) photograph.style[name] = `${pixels}px`;
-  photograph.style.setProperty("--at", `${100 * share}%`);
-  for (const [name, pixels] of Object.entries({ left: left + share * box.width, top, height: box.height })) seam.style[name] = `${pixels}px`;
-  if (photograph.src !== source) photograph.src = source;
+  for (const [name, pixels] of Object.entries(box)) frame.style[name] = `${pixels}px`;
+  frame.style.setProperty("--at", `${byId("wipe").value}%`);
+  if (source && photograph.src !== source) photograph.src = source;
+}
+
+// The colors of depths, with near and far in the capture's units, or in meters.
+function tellDepths({ view, picture, player }) {
+  byId("scale").hidden = view.shown !== 1;
+  if (view.shown !== 1) return;
+  const { metres, depth_colors: colors } = view.about, unit = metres === null ? "" : " m", nearest = [...colors].reverse();
+  const color = (shares) => `rgb(${shares.map((share) => Math.round(255 * share)).join(" ")})`;
+  document.querySelector("#scale i").style.background = `linear-gradient(to right, ${nearest.map(color).join(", ")})`;
+  ["near", "far"].forEach((name, i) => {
+    byId(name).value = (picture.depths_shown[i] * player.path.scale * (metres ?? 1)).toPrecision(3) + unit;
+  });
 }
 
 function sourceOf(number) {
@@ -285,12 +296,12 @@ function listenToKeys(frames) {
     b: () => byId("background").click(), h: () => hideControls(frames), home: () => home(frames),
     i: () => byId("numbers").showModal(), t: () => frames.turn(!frames.turning), f: fullScreen, p: () => savePicture(frames),
     v: () => marks.addView(), n: () => marks.begin("note"), m: () => marks.begin("distance"), escape: () => marks.begin(null),
-    enter: () => marks.tap(...shownPart().map((side) => side / 2)), delete: () => marks.remove(), backspace: () => marks.remove(),
+    enter: () => marks.tapMiddle(), delete: () => marks.remove(), backspace: () => marks.remove(),
     " ": () => frames.player.toggle(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
     const key = event.key.toLowerCase();
-    if (event.ctrlKey || event.metaKey || event.altKey || byId("numbers").open || event.target.matches("input, select")) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || event.target.matches("input, select")) return;
     if ((key === " " || key === "enter") && event.target.matches("button, summary")) return;  // it is pressed by that
     if (held(key)) {
       event.preventDefault();

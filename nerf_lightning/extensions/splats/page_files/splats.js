@@ -35,7 +35,7 @@ class Picture {
     }
     this.splats = splatsOf(about, content);
     const { count } = this.splats;
-    Object.assign(this, { depths: new Float32Array(count), starts: new Uint32Array(BUCKETS + 1) });
+    Object.assign(this, { depths: new Float32Array(count), depths_shown: [0, 1], starts: new Uint32Array(BUCKETS + 1) });
     this.program = this.linked();
     gl.useProgram(this.program);
     gl.disable(gl.DITHER);
@@ -120,7 +120,8 @@ class Picture {
     const [width, height] = ["clientWidth", "clientHeight"].map((side) => Math.max(1, Math.round(this.canvas[side] * ratio)));
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    const { focal, center } = lensIn(view, ratio), away = length(minus(view.eye, this.about.middle));
+    const { focal, center } = lensIn(view, ratio);
+    if (view.shown === 1) this.depths_shown = this.visibleDepths(view);
     gl.viewport(0, 0, width, height);
     gl.uniform2f(this.at("size"), width, height);
     gl.uniform2fv(this.at("focal"), focal);
@@ -129,7 +130,7 @@ class Picture {
     gl.uniformMatrix3fv(this.at("turn"), false, view.axes.flat());
     gl.uniform1f(this.at("dilation"), this.dilation(focal));
     gl.uniform1i(this.at("shown"), view.shown);
-    gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
+    gl.uniform2fv(this.at("depths"), this.depths_shown);
     const drawn = this.sort(view);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.across, this.down, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order);
     gl.clearColor(...view.behind, 1);
@@ -139,6 +140,21 @@ class Picture {
 
   // In a finer picture than the photographs' splats are wider by as much: they touch as they did in the fitting.
   dilation(focal) { return this.about.dilation * Math.max(1, focal[0] / this.about.focal) ** 2; }
+
+  // The nearest and the farthest of the opaque splats in the window, without the outer 2 %, as the viewer has it.
+  visibleDepths(view) {
+    const { focal, center } = lensIn(view), { count, places, bytes, texels } = this.splats, found = [];
+    for (let i = 0; i < count; i++) {
+      if (bytes[4 * texels * i + 7] < 128) continue;
+      const from = minus(places.subarray(3 * i, 3 * i + 3), view.eye);
+      const [x, y, z] = view.axes.map((axis) => dot(axis, from));
+      const [left, top] = [center[0] - focal[0] * x / z, center[1] + focal[1] * y / z];
+      if (-z > this.about.near && left >= 0 && left < innerWidth && top >= 0 && top < innerHeight) found.push(length(from));
+    }
+    if (!found.length) return [0, 1];
+    const sorted = Float32Array.from(found).sort(), at = (share) => sorted[Math.round(share * (found.length - 1))];
+    return [at(0.02), Math.max(at(0.98), at(0.02) + 1e-6)];
+  }
 
   // How far away the surface is along the ray through a place of the window (in pixels of CSS): where half of the light
   // is stopped; 0: nowhere.

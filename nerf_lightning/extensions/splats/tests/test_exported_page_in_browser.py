@@ -12,6 +12,7 @@ from support.page_in_browser import (
     drawn,
     drawn_through,
     hide_controls,
+    name_it,
     press,
     psnr,
     shot,
@@ -68,18 +69,25 @@ def test_it_shows_what_the_rasterizer_draws_and_asks_for_nothing(page):
 @pytest.mark.parametrize("page", [2], indirect=True)
 def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
     box = "document.getElementById(id).getBoundingClientRect()"
-    edges = f"return ['photograph', 'photographs', 'places'].map(id => {box})"
+    edges = f"return ['photograph', 'photographs', 'controls'].map(id => {box})"
+    wipe = "document.getElementById('wipe')"
+    wiping = f"return [{wipe}.getBoundingClientRect(), getComputedStyle({wipe}).getPropertyValue('--thumb').trim()]"
     with opened(page.as_uri(), 1280, 800) as driver:
         for size in SIZES:
             assert layout_faults(driver, size) == []
             wait_for(driver, "still")
-            photograph, strip, places = driver.execute_script(edges)
-            assert photograph["top"] >= 0
-            assert photograph["bottom"] <= places["top"] + 1 < strip["top"]
+            photograph, strip, controls = driver.execute_script(edges)
+            assert controls["bottom"] < photograph["top"] + 1
+            assert photograph["bottom"] <= strip["top"] + 1
+            bars = SIZES[size][1] - (strip["top"] - controls["bottom"])
+            assert bars < 0.2 * SIZES[size][1]
+            # The slider is as wide as the photograph, its thumb half beyond either end.
+            slider, thumb = driver.execute_script(wiping)
+            assert slider["width"] == pytest.approx(photograph["width"] + float(thumb.removesuffix("px")))
             assert strip["bottom"] == pytest.approx(SIZES[size][1])
-            # Nothing moves when the slider between scene and photograph goes.
+            # Nothing moves when the slider between photograph and render goes.
             press(driver, "arrowleft")
-            assert driver.execute_script(edges)[2] == places
+            assert driver.execute_script(edges)[1:] == [strip, controls]
             driver.execute_script("dispatchEvent(new KeyboardEvent('keyup', {key: 'arrowleft'}))")
             # Fingers or keys: what there is.
             press(driver, "i")
@@ -89,7 +97,7 @@ def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
             controls = "[...document.querySelectorAll('button, select, summary, label')]"
             heights = driver.execute_script(f"return {controls}.map(each => each.getBoundingClientRect().height)")
             assert min(filter(None, heights)) >= (40 if size == "phone" else 24)
-            before = "document.getElementById('full').getBoundingClientRect()"
+            before = "document.getElementById('turn').getBoundingClientRect()"
             left = driver.execute_script(f"return {before}.left")
             driver.execute_script("document.getElementById('tools').open = false")
             assert driver.execute_script(f"return {before}.left") == left, "opening the tools moves nothing"
@@ -113,7 +121,8 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
         wait_for(driver, "still")
         box = run("const b = document.getElementById('photograph').getBoundingClientRect(); return [b.width, b.height]")
         assert box[0] == pytest.approx(box[1])
-        assert not run("return document.getElementById('photograph').hidden")
+        assert not run("return document.getElementById('frame').hidden")
+        assert run("return document.getElementById('frame').innerText").split() == ["Photograph", "Render"]
         run("document.getElementById('wipe').value = 0")
         hide_controls(driver)
         colors = shot(driver)
@@ -121,6 +130,10 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
             press(driver, str(number + 1))
             wait_for(driver, "still")
             assert np.abs(shot(driver) - colors).mean() > 0.01
+            assert run("return document.getElementById('scale').hidden") == (number != 1)
+        near, far = run("return ['near', 'far'].map(id => Number(document.getElementById(id).value))")
+        eye = np.linalg.norm(read_page(page)[0]["cameras"][1]["eye"])
+        assert eye - 1 < near < far < eye + 1  # the ball is in the middle
         press(driver, "i")
         assert run("return document.getElementById('numbers').open")
 
@@ -190,13 +203,13 @@ def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_fil
         assert run("return document.getElementById('play').textContent") == "Pause"
         press(driver, " ")
         wait_for(driver, "still")
-        run("window.prompt = (_, name) => name")
         for view in range(3):
             run(f"document.querySelectorAll('#photographs button')[{view}].click()")
             drag(driver, 30, 10)
             wait_for(driver, "still")
             recorded = shot(driver)
             press(driver, "v")
+            name_it(driver, f"view {view}")
         assert run("return document.getElementById('length').value") == "4.0 s"
         run("document.getElementById('save').click()")
         file = tmp_path / "camera_path.yaml"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from support.browser import drag, opened
-from support.page_in_browser import drawn, hide_controls, press, psnr, shot, wait_for, wait_until_there
+from support.page_in_browser import drawn, hide_controls, name_it, press, psnr, shot, wait_for, wait_until_there
 from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
 
 from nerf_lightning.extensions.splats.page import PageExport
@@ -54,12 +54,14 @@ def test_views_notes_and_distances_are_shown_added_saved_and_stay_texts(page, tm
         found = shot(driver)
         height, width = found.shape[:2]
         assert psnr(found, drawn(page, 2, width, height)) > 38
-        run("window.prompt = () => 'mine'")
         press(driver, "v")
+        name_it(driver, "mine")
         press(driver, "n")
+        assert run("return document.getElementById('told').textContent").startswith("Click")  # there is a mouse
         run(TAP, 2, 2)
         assert run("return document.getElementById('told').textContent").startswith("There is nothing here")
         run(TAP, width / 2, height / 2)
+        name_it(driver, "mine")
         press(driver, "m")
         run(TAP, width / 2, height / 2)
         run(TAP, width / 2, height / 2 + 30)
@@ -97,11 +99,12 @@ def test_labels_at_one_point_do_not_overlap_and_same_texts_are_numbered(page):
     with opened(page.as_uri(), 500, 400) as driver:
         run = driver.execute_script
         wait_for(driver, "still")
-        run("window.prompt = () => 'mine'")
         for _ in range(3):
             press(driver, "v")
+            name_it(driver, "mine")
             press(driver, "n")
             press(driver, "enter")
+            name_it(driver, "mine")
         wait_for(driver, "still")
         assert run("return [...document.querySelectorAll('#views button')].map(each => each.textContent)")[1:] == (
             ["mine", "mine (2)", "mine (3)"]
@@ -110,6 +113,8 @@ def test_labels_at_one_point_do_not_overlap_and_same_texts_are_numbered(page):
         notes = "[...document.querySelectorAll('#pins .note')].filter(each => each.textContent.startsWith('mine'))"
         boxes = run(f"return {notes}.map(each => {{ {box} }})")
         assert all(below[0] >= above[1] for above, below in pairwise(boxes))
+        leaders = run("return [...document.querySelectorAll('#lines path')].map(each => each.getAttribute('d'))")
+        assert sum(not leader.endswith(" v 0") for leader in leaders) >= 2  # to labels that had to give way
 
 
 def test_it_turns_by_itself_until_it_is_touched(page):
