@@ -1,7 +1,7 @@
 """The core is whole without extensions, in a copy of the project that lacks them.
 
 That nothing of it imports them, the layers in pyproject.toml forbid. Here every test is collected, and those are run
-that go through all options of the configs, and each command once.
+that go through all options of the configs, and the main commands.
 """
 
 import os
@@ -18,9 +18,8 @@ COPIED = ("nerf_lightning", "conf", "docs", "tests", "conftest.py", "pyproject.t
 DOCUMENTS = ("tests/test_documents.py", "tests/test_packaging.py")
 """They are of the whole project, and name commands and files of extensions."""
 TRIED = (
-    *("test_configs.py", "test_setting_rules.py", "test_reader_settings.py", "test_kept_checkpoints.py"),
-    *("test_cli.py", "test_help.py", "test_completion.py", "test_own_parts.py", "test_train_eval_render.py"),
-    *("test_export.py", "test_doctor.py"),
+    *("test_configs.py", "test_setting_rules.py", "test_kept_checkpoints.py", "test_cli.py", "test_help.py"),
+    *("test_completion.py", "test_train_eval_render.py", "test_export.py"),
 )
 
 

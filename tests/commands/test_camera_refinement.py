@@ -15,6 +15,7 @@ SETTINGS = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data
             *FAST_PATH, "trainer.max_steps=20", "final.video=false")  # fmt: skip
 
 
+@pytest.mark.minutes
 def test_a_run_says_how_far_its_cameras_moved_and_every_command_uses_them(nerf, capture, tmp_path):
     with pytest.MonkeyPatch.context() as patch:  # how close fitted cameras come is tried where they are fitted
         patch.setattr(camera_fit, "NUM_STEPS", 6)

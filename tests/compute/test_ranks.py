@@ -65,6 +65,7 @@ result = own, [*(parameter.grad for parameter in parameters), counts], messages
 """
 
 
+@pytest.mark.minutes
 def test_two_processes_have_the_same_sums_in_a_message_for_all_small_tensors_of_a_type(tmp_path):
     (one, sums, messages), (other, same, _) = in_two_processes(SUMS, tmp_path)
     assert messages == [ranks.LARGE + 1, 3 + 1 + 35 + 6, 2]

@@ -101,8 +101,8 @@ def a_march(device, generator, count, share, resolution=16, step=0.05):
 def check_march(kernels, device, generator, rays):
     cases = [(share, limit, capacity) for share in (0.0, 0.03, 1.0) for limit, capacity in ((None, 4000), (5, None))]
     for share, limit, capacity in [*cases, (0.5, None, 100), (0.5, None, None), (SOLID, None, None)]:
-        fine = {"resolution": 64, "step": 0.01} if share == SOLID else {}
-        given = a_march(device, generator, rays, share, **fine)
+        fine = {"resolution": 64, "step": 0.01} if share == SOLID else {}  # four times as many steps
+        given = a_march(device, generator, rays // 4 if fine else rays, share, **fine)
         for one, other in zip(
             kernels.distances_in_box(given[0], given[3].aabb), (given[1].enter, given[1].leave), strict=True
         ):

@@ -1,4 +1,4 @@
-"""Every model yaml trained and rendered on devices that are not there (`support.stand_in_device`).
+"""Every kind of model trained and rendered on devices that are not there (`support.stand_in_device`).
 
 Once a run is warm, no step may wait but where a function is named here, with how often. Pictures may: their rays are
 followed in rounds, until none is left.
@@ -33,14 +33,15 @@ SOURCES = {"choose_sources": 3 * (STEPS - WARM), "ViewTransformer._looked_up": 2
 # Each of the 12 that are trained is sent once, when it is first looked at.
 SENT, PHOTOGRAPHS = "ViewTables._pictures.<locals>.make", 12
 
-# `auto` is `fast` until a scene is read.
-MODELS = [name for name in options("model") if name != "auto"]
+# `auto` is `fast` until a scene is read; of the others that are left out a smaller one runs the same code.
+SAME = ("auto", "fast", "fast_large", "nerf", "nerf_small", "view_transformer")
+MODELS = [name for name in options("model") if name not in SAME]
 SINGLE = ("fast_small", "nerf_tiny")  # in float32, too
-ALWAYS = (*SINGLE, "fast_proposal", "view_transformer_tiny")  # one of each kind; make test-slow has the others
 
 
-def marked(*model):
-    return pytest.param(*model, marks=() if model[0] in ALWAYS else pytest.mark.minutes)
+def marked(*case):
+    """All but one are left to make test-slow."""
+    return pytest.param(*case, marks=() if case == ("fast_small", "bf16-mixed") else pytest.mark.minutes)
 
 
 def run_on(there, model, precision):
@@ -74,7 +75,8 @@ def losses_on_the_cpu(model):
 
 
 @pytest.mark.parametrize(
-    ("model", "precision"), [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in SINGLE]
+    ("model", "precision"),
+    [marked(model, "bf16-mixed") for model in MODELS] + [marked(model, "32-true") for model in SINGLE],
 )
 def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
     with StandInDevice("cuda") as there, backends.without("hash_grid.cuda", "mlp.cuda"):
@@ -87,9 +89,8 @@ def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
         assert run.all_losses().tolist() == pytest.approx(losses_on_the_cpu(model), rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    "model", [pytest.param(name, marks=() if name in SINGLE else pytest.mark.minutes) for name in MODELS]
-)
+@pytest.mark.minutes
+@pytest.mark.parametrize("model", MODELS)
 def test_every_model_trains_and_renders_on_mps(model):
     with StandInDevice("mps") as there:
         run = run_on(there, model, "32-true")
@@ -105,7 +106,7 @@ BESIDE = {
 }
 
 
-@pytest.mark.parametrize("kind", ["cuda", "mps"])
+@pytest.mark.parametrize("kind", ["cuda", pytest.param("mps", marks=pytest.mark.minutes)])
 @pytest.mark.parametrize("number", range(max(map(len, BESIDE.values()))))
 def test_what_learns_beside_a_model_neither_waits_nor_lies_apart(number, kind):
     """An option of each group at a time."""

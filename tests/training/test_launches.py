@@ -18,9 +18,7 @@ BUDGETS = {
     "fast_small,bf16-mixed": (80, 5, 33, 3),
     "fast_proposal,bf16-mixed": (116, 5, 26, 3),
     "nerf_tiny,bf16-mixed": (246, 6, 110, 4),
-    "fast,bf16-mixed": (80, 5, 33, 3),
     "fast,32-true": (97, 5, 40, 3),
-    "fast_proposal,32-true": (138, 5, 35, 3),
 }
 # How far losses may be apart after up to two steps: bfloat16 has 8 bits, and Adam's first steps follow signs.
 TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}

@@ -76,6 +76,7 @@ result = sizes, replayed, taken, [each.detach() for each in runs[0].training.obj
 """
 
 
+@pytest.mark.minutes
 def test_two_processes_that_replay_their_shares_learn_what_they_learn_without_and_the_same(tmp_path):
     one, other = in_two_processes(IN_TWO, tmp_path)
     for (sizes, replayed, taken, _), shares in ((one, [24, 16, 24]), (other, [24, 16, 23])):

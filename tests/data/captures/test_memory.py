@@ -30,6 +30,7 @@ for factor, few, many in ((1, 16, 4), (2, 4, 1)):
 """
 
 
+@pytest.mark.minutes
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
 def test_reading_takes_the_store_and_no_more(tmp_path):
     Image.radial_gradient("L").resize((SIDE, SIDE)).convert("RGBA").save(tmp_path / "r_0.png")

@@ -11,6 +11,8 @@ from support.running import REPOSITORY
 from nerf_lightning.nerf.kernels import backends
 
 CPUS = {"apple-m1": "aarch64-apple-darwin", "neoverse-n1": "aarch64-linux-gnu"}
+BY_HAND = ("mlp.cpu", "hash_grid.cpu", "table_adam.cpu")
+"""Those that choose instructions themselves."""
 # In a process of its own: as for a CPU of which nothing is known, with an empty cache, as a kept kernel has no code. It
 # is taken before LLVM makes instructions of it, which replaces some operations by those of this machine.
 COMPILE = r"""
@@ -44,11 +46,15 @@ for module in sys.argv[2:]:
 """
 
 
-@pytest.mark.minutes
-@pytest.mark.parametrize("half", [0, 1])
-def test_every_kernel_becomes_assembly_of_other_cpus_and_names_no_instruction_of_intels(half, tmp_path):
-    """In two halves, for two workers."""
-    modules = tuple(backends.CPU_BACKENDS)[half::2]
+@pytest.mark.parametrize(
+    "modules",
+    [
+        pytest.param(BY_HAND, marks=pytest.mark.minutes, id="by hand"),
+        pytest.param([each for each in backends.CPU_BACKENDS if each not in BY_HAND], marks=pytest.mark.exhaustive,
+                     id="by the compiler"),
+    ],
+)  # fmt: skip
+def test_every_kernel_becomes_assembly_of_other_cpus_and_names_no_instruction_of_intels(modules, tmp_path):
     generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_INTEL_SVML": "1"}
     done = subprocess.run(
         [sys.executable, "-c", COMPILE, json.dumps(CPUS), *modules], cwd=REPOSITORY, capture_output=True,

@@ -41,8 +41,10 @@ SMALL = {
 }
 """What `trial` of each other module launches."""
 BFLOAT16 = [name for name in DEVICES if name != "sm_75"]  # where float32 is used instead
-# The one that the kernels of the default model did not fit into is always tried.
-FOR_ALL = [pytest.param(name, marks=[] if name == "sm_89" else pytest.mark.minutes) for name in DEVICES]
+# The one that the kernels of the default model did not fit into is always tried. Those that differ from another in age
+# or in shared memory alone, and the largest of data centers, are left to make test-all.
+MARKS = {"sm_89": [], **dict.fromkeys(("sm_75", "sm_120", "gfx942"), pytest.mark.minutes)}
+FOR_ALL = [pytest.param(name, marks=MARKS.get(name, pytest.mark.exhaustive)) for name in DEVICES]
 USED = torch.ones(1, dtype=torch.int64)
 """Where padding begins, as kernels get it of rays with different numbers of samples."""
 MOST_SPILLED = 152
@@ -124,8 +126,12 @@ def test_small_kernels_compile_and_keep_all_in_registers(name, monkeypatch):
         assert made.spilled() <= (MOST_SPILLED if module == "field.cuda" else 0), module  # as other MLPs
 
 
-@pytest.mark.minutes
-@pytest.mark.parametrize("name", BFLOAT16)
+WIDEST = {"sm_89": pytest.mark.minutes, "sm_100": pytest.mark.minutes}  # one that has the room, and one that lacks it
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=WIDEST.get(name, pytest.mark.exhaustive)) for name in BFLOAT16]
+)
 def test_the_widest_layers_fit_or_are_refused(name, caplog):
     with compiled_for(name, KERNELS), caplog.at_level(logging.WARNING):
         assert mlp.takes((32, 128, 128, 3), torch.device("cpu"))
@@ -190,13 +196,16 @@ check_against_the_reference("cpu", 140)
 cuda.PROGRAMS = 2  # so that one takes several blocks
 check_perceptron("cpu", [0, 1, 640])
 """
-QUICK = ("table_adam.cuda", "pixels.cuda", "rays.cuda")
+SLOW = ("render.cuda", "histograms.cuda")
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize(
     ("code", "names"),
-    [(INTERPRETED, QUICK), pytest.param(INTERPRETED + LARGE, tuple(SMALL), marks=pytest.mark.minutes)],
-    ids=["quick", "all"],
+    [
+        pytest.param(INTERPRETED, SLOW, id="slow"),
+        pytest.param(INTERPRETED + LARGE, sorted({*SMALL} - {*SLOW}), id="others"),
+    ],
 )
 def test_through_the_interpreter(code, names):
     pytest.importorskip("triton", reason="triton is not installed (Linux only)")

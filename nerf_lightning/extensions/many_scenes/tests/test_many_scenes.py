@@ -103,6 +103,7 @@ def run(tmp_path_factory):
     return made_once(tmp_path_factory, "many_scenes", train) / "run"
 
 
+@pytest.mark.minutes
 def test_a_run_is_judged_on_a_scene_that_it_never_saw_and_renders_others(nerf, run, tmp_path):
     assert list(json.loads((run / "metrics.json").read_text())["captures"]) == ["bricks_201"]
     assert (run / "video.mp4").stat().st_size > 0

@@ -17,6 +17,7 @@ def kernels_alone(monkeypatch):
     monkeypatch.setattr(training, "checks", lambda *given: [])
 
 
+@pytest.mark.minutes
 def test_a_machine_that_computes_right(nerf, kernels_alone, tmp_path):
     result = done(nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out"))
     assert "hash grid: gradient of the table" in result.out
