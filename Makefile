@@ -6,10 +6,6 @@ XLA_VENV := .venv-xla
 NERFBASELINES_VENV := .venv-nerfbaselines
 # Hydra overrides: make train ARGS="scene=blender scene.root=data/lego"
 ARGS ?=
-# How long make soak lasts.
-SECONDS ?= 1800
-# How many captures of each kind the doctor is tried on.
-SEEDS ?= 25
 # How many times as many cases as in make test make fuzz tries.
 TIMES ?= 200
 # How many tests run at a time.
@@ -33,7 +29,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-ci test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-slow test-ci test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench fuzz clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-20s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -136,12 +132,6 @@ docs: setup ## Build the documents as a site, and run their notebooks where they
 
 bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 	@$(VENV)/bin/nerf bench $(ARGS)
-
-soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
-	@$(VENV)/bin/python tests/soak.py $(SECONDS)
-
-doctor-rates: setup ## How often each check of the doctor raises a false alarm, over SEEDS captures of 8 kinds; 40 minutes for SEEDS=8
-	@$(VENV)/bin/python tests/doctor_rates.py $(SEEDS)
 
 fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each time
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_planted_resume.py

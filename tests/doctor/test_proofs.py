@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from support.doctor_scene import VIEWS, corner_analysis, corner_scene, with_poses
-from support.planted_poses import rotation_about
 
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
@@ -36,7 +35,9 @@ def without_corners(analysis, view=VIEW):
 
 def turned(degrees, view=VIEW):
     c2w = corner_scene().cameras.c2w.clone()
-    c2w[view, :, :3] = rotation_about(torch.tensor([1.0, 0.5, 0.0]), degrees) @ c2w[view, :, :3]
+    x, y, z = torch.nn.functional.normalize(torch.tensor([1.0, 0.5, 0.0]), dim=0).tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    c2w[view, :, :3] = torch.matrix_exp(cross * torch.deg2rad(torch.tensor(degrees))) @ c2w[view, :, :3]
     return with_poses(c2w)
 
 

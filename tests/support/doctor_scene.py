@@ -5,12 +5,12 @@ from dataclasses import replace
 from functools import cache
 
 import torch
-from support import planted_poses
 from support.corner import FOCAL, HEIGHT, WIDTH, corner_poses, photograph
 
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.doctor import poses
 from nerf_lightning.doctor.check import Analysis, Check
+from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.examine import CHECKS, analyze
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
@@ -53,7 +53,9 @@ def corner_analysis() -> Analysis:
 
 def with_poses(c2w: torch.Tensor) -> Analysis:
     """The same photographs, so the same matches, with other poses."""
-    return planted_poses.with_poses(corner_analysis(), c2w)
+    sound = corner_analysis()
+    cameras = replace(sound.scene.cameras, c2w=c2w)
+    return replace(sound, scene=replace(sound.scene, cameras=cameras), agrees=agreeing(sound.matches, c2w))
 
 
 def with_scene(**changes) -> Analysis:

@@ -10,7 +10,6 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 from support.configs import composed
-from support.running import output_of, start_code
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
@@ -78,12 +77,3 @@ def replace_pickle(path: Path, content: bytes) -> None:
 def many_bytes(count: int) -> bytes:
     """Return a pickle of a few bytes that asks for many."""
     return pickle.dumps(Payload(bytearray, count), protocol=2).replace(b"__builtin__", b"builtins")
-
-
-def peak_of(code: str, *arguments: object) -> tuple[int, list[str]]:
-    """Run code in a process of its own; return by how much its peak memory grew after `# begin`, and its words."""
-    before, after = code.split("# begin\n")
-    measure = "peak = lambda: 1024 * int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])\n"
-    whole = f"import sys\n{measure}{before}start = peak()\n{after}print('grown', peak() - start)\n"
-    *lines, grown = output_of(start_code(whole, *arguments)).splitlines()
-    return int(grown.split()[1]), lines

@@ -15,7 +15,7 @@ pytest.importorskip("triton", reason="triton is not installed (Linux only)")
 BUDGETS = {
     # On the device (operations and kernels): a step, one that is replayed beside its replay, a rendered tile. On the
     # host: a step.
-    "fast_small,bf16-mixed": (80, 5, 33, 3),
+    "fast,bf16-mixed": (80, 5, 33, 3),
     "fast_proposal,bf16-mixed": (116, 5, 26, 3),
     "nerf_tiny,bf16-mixed": (246, 6, 110, 4),
     "fast,32-true": (97, 5, 40, 3),

@@ -1,13 +1,11 @@
 """From a capture to near, far, space, the doctor's verdict and a film, in places whose distances are known."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from support.brick_places import Place, corridor, heap, outward_ring
 
-from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.nerf.geometry.world_frame import unit_of
 from nerf_lightning.nerf.types.scene import Scene
@@ -81,9 +79,3 @@ def test_seven_cameras_that_were_moved_away(tmp_path):
     kept = sorted({*range(30)} - {*moved})
     assert 0.3 < float(scene.cameras.c2w[kept, :, 3].norm(dim=-1).median()) < 1.0
     assert float(assert_filmed_as_photographed(scene).max()) < 1.5
-
-
-def test_cameras_around_a_heap_whose_axes_are_others_are_wrong(tmp_path):
-    scene = heap().read("transforms", tmp_path / "capture")
-    flipped = replace(scene, cameras=replace(scene.cameras, c2w=axes(scene.cameras.c2w, FLIP_YZ)))
-    assert verdicts(flipped)["camera directions"] == "wrong"
