@@ -17,7 +17,7 @@ from nerf_lightning.data.depth_rays import DepthRays
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.contrast import choose
+from nerf_lightning.nerf.contrast import choose, shares
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.kernels.pixels.op import Domain, Order, has_kernel, ordered_batch
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
@@ -137,12 +137,14 @@ class RayBatches:
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device for which a background thread makes batches; None: no such thread.
         self.prefetch_for: torch.device | None = None
+        self.shares = shares(scene.pixels) if self.candidates > 1 else None
         self.take_from(scene)
         self.num_steps = self.epoch_steps
 
     def take_from(self, scene: Scene) -> None:
         """Make batches from this copy of the scene, whose pixels are in memory, in a mapped file, or on a device."""
         self.scene = scene
+        self.shares = None if self.shares is None else self.shares.to(scene.pixels.rgba.device)
         self.whole = PixelDomain(scene, scene.splits["train"], patch=self.patch)
         self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction, self.patch)
         depths = DepthRays(scene, self.patch) if self.depth_every and scene.depths is not None else None
@@ -206,10 +208,10 @@ class RayBatches:
         rays = Order(places, len(domain), fold(self.seed, attempt, purpose), self.candidates)
         numbered = Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
         if self.depths is None:
-            return ordered_batch(rays, numbered, self.scene.pixels)
+            return ordered_batch(rays, numbered, self.scene.pixels, self.shares)
         among, key = self._depth_places_at(rays_seen, batch_rays), fold(self.seed, attempt, "depths")
         of_known = Order(among, len(self.depths), key)
-        return ordered_batch(rays, numbered, self.scene.pixels, self.depths.depths, of_known)
+        return ordered_batch(rays, numbered, self.scene.pixels, self.shares, self.depths.depths, of_known)
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return this process's pixels of that batch."""
@@ -232,7 +234,9 @@ class RayBatches:
         every = range(places.start * self.candidates, places.stop * self.candidates)
         pixels, weight = domain.locate(self._in_order(every, len(domain), attempt, purpose), shift), None
         if self.candidates > 1:
-            pixels, weight = choose(self.scene.pixels, pixels, places, fold(self.seed, attempt, purpose))
+            assert self.shares is not None
+            key = fold(self.seed, attempt, purpose)
+            pixels, weight = choose(self.scene.pixels, self.shares, pixels, places, key)
         if self.depths is not None:
             pixels = concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
         return pixels, weight

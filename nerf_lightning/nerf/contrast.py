@@ -7,54 +7,63 @@ so every device chooses the same pixels.
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.randomness import WORD, fold, mix
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
 
-FLAT = 6_500
-"""The share of a pixel without contrast; a black pixel between four white ones has 260,100 more."""
-NEIGHBORS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+FLAT, HIGHEST, SHIFT = 6, 255, 10
+"""Shares of pixels without contrast, and of the highest; one more for every 2^10 of differences between colors."""
 
 
-def shares(store: PixelStore, pixels: PixelIndex) -> Int[Tensor, "*n"]:
-    """Return in proportion to what pixels are chosen; 0 for masked ones."""
-    width, height = store.width[pixels.view], store.height[pixels.view]
+def shares(store: PixelStore) -> UInt8[Tensor, "pixels"]:
+    """Return in proportion to what each pixel is chosen: by its differences from four neighbors; 0 if it is masked.
 
-    def color(x: Tensor, y: Tensor) -> Int[Tensor, "*n 4"]:
-        rgba = store.rgba[store.index_of(pixels.view, x, y)].to(torch.int32)
-        return torch.cat([rgba[..., :3] * rgba[..., 3:], 255 * rgba[..., 3:]], dim=-1)
+    Differences are of colors times alpha, and of alpha, in the channel where they are largest.
+    """
+    out = torch.zeros(len(store.rgba), dtype=torch.uint8, device=store.rgba.device)
+    kernels = cpu_backend("pixels.cpu", out.device)
+    for view in range(len(store.width)):
+        picture, mask = store.view(view), store.view_mask(view)
+        share = contrast(picture) if kernels is None else kernels.contrast(picture)
+        start = int(store.offset[view])
+        out[start : start + share.numel()] = (share if mask is None else share * mask).flatten()
+    return out
 
-    here = color(pixels.x, pixels.y)
-    around = (
-        color((pixels.x + dx).clamp(min=0).minimum(width - 1), (pixels.y + dy).clamp(min=0).minimum(height - 1))
-        for dx, dy in NEIGHBORS
-    )
-    contrast = torch.stack([(each - here).abs() for each in around]).sum(dim=0).amax(dim=-1)
-    share = contrast.long() + FLAT
-    return share if store.mask is None else share * store.mask[store.index_of(pixels.view, pixels.x, pixels.y)]
+
+def contrast(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "height width"]:
+    """Return the shares of a picture's pixels, none of which is masked."""
+    color = rgba.to(torch.int32)
+    color = torch.cat([color[..., :3] * color[..., 3:], 255 * color[..., 3:]], dim=-1)
+    change = torch.zeros_like(color)
+    down, across = (color[1:] - color[:-1]).abs(), (color[:, 1:] - color[:, :-1]).abs()
+    for part, step in ((change[1:], down), (change[:-1], down), (change[:, 1:], across), (change[:, :-1], across)):
+        part += step
+    return ((change.amax(dim=-1) >> SHIFT) + FLAT).clamp(max=HIGHEST).to(torch.uint8)
 
 
 def choose(
-    store: PixelStore, candidates: PixelIndex, places: range, key: int
+    store: PixelStore, share_map: UInt8[Tensor, "pixels"], candidates: PixelIndex, places: range, key: int
 ) -> tuple[PixelIndex, Float[Tensor, "rays"]]:
     """Return one of each ray's candidates, and the rays' weights.
 
     Args:
         store: the photographs.
+        share_map: their `shares`.
         candidates: pixels, equally many for each place, those of a place one after another.
         places: of the rays, in the run's order of rays.
         key: of the order.
     """
     each = len(candidates.view) // max(len(places), 1)
-    first = torch.arange(len(places), device=candidates.view.device) * each
+    of_all = share_map[store.index_of(candidates.view, candidates.x, candidates.y)].long().view(-1, each)
+    first = torch.arange(len(places), device=of_all.device) * each
     chosen, share, total = first, torch.zeros_like(first), torch.zeros_like(first)
-    all_shares = shares(store, candidates)
-    for number in range(each):
-        word = mix(((first + number + places.start * each) & WORD) ^ fold(key, "contrast"))
-        own = all_shares[first + number]
+    chooser = fold(key, "contrast")
+    for number, own in enumerate(of_all.unbind(dim=1)):
+        word = mix(((first + number + places.start * each) & WORD) ^ chooser)
         total = total + own
         taken = (word >> 8) * total < (own << 24)
         chosen, share = torch.where(taken, first + number, chosen), torch.where(taken, own, share)

@@ -9,7 +9,6 @@ from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.contrast import FLAT, shares
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.rays import PixelIndex
 
 
 def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
@@ -170,8 +169,7 @@ def test_rays_prefer_contrast_and_weigh_less_there():
     drawn = [loader.batch_at(0, 432 * number) for number in range(100)]
     number = torch.cat([flat(scene, batch.pixels) for batch in drawn])
     weight = torch.cat([batch.weight for batch in drawn])
-    every = PixelIndex(*(torch.cat([getattr(batch.pixels, axis) for batch in drawn]) for axis in ("view", "x", "y")))
-    edges = shares(scene.pixels, every) > 10 * FLAT
+    edges = shares(scene.pixels)[number] > 10 * FLAT
     assert float(edges.float().mean()) > 1.5 * float((weight * edges).mean())
     # Weighted, it is as if pixels were drawn evenly: 43,200 colors of a standard deviation below 128.
     assert float((weight * colors[number]).mean()) == pytest.approx(float(colors.mean()), abs=4 * 128 / 43_200**0.5)

@@ -24,7 +24,7 @@ ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
 CPU_BACKENDS = (
     *("render.dense", "render.gradients", "render.cpu", "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
-    *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "table_adam.cpu"),
+    *("histograms.cpu", "march.cpu", "ragged.cpu", "random.cpu", "lenses.cpu", "pixels.cpu", "table_adam.cpu"),
 )
 """The modules that numba compiles, slowest first."""
 CUDA_BACKENDS = (

@@ -8,8 +8,9 @@ from typing import no_type_check
 import torch
 import triton
 import triton.language as tl
+from jaxtyping import UInt8
+from torch import Tensor
 
-from nerf_lightning.nerf.contrast import FLAT
 from nerf_lightning.nerf.kernels.pixels.op import NOWHERE, Domain, Order
 from nerf_lightning.nerf.kernels.random.cuda import mix
 from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, fold, grid_of
@@ -21,7 +22,12 @@ BLOCK = 64
 
 
 def batch(
-    rays: Order, domain: Domain, store: PixelStore, depths: KnownDepths | None = None, of_known: Order = NOWHERE
+    rays: Order,
+    domain: Domain,
+    store: PixelStore,
+    shares: UInt8[Tensor, "pixels"] | None = None,
+    depths: KnownDepths | None = None,
+    of_known: Order = NOWHERE,
 ) -> Batch:
     """Return the batch (`op.ordered_batch`)."""
     device, several = store.rgba.device, len(rays.places)
@@ -36,9 +42,9 @@ def batch(
             fold(rays.key, "contrast"),
             *(count, of_known.places.start, of_known.size, of_known.key, *grid_of(of_known.size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
-            *(store.offset, store.width, store.height, store.rgba, store.mask),
+            *(store.offset, store.width, store.rgba, store.mask, shares),
             *([None] * 5 if depths is None else depths.tensors()),
-            *(rays.candidates, FLAT, FEISTEL_ROUNDS),
+            *(rays.candidates, FEISTEL_ROUNDS),
             BLOCK,
         )
     return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
@@ -54,7 +60,7 @@ def trial(device: str = "cuda") -> None:
     domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
     store = PixelStore(rgba.view(8, 4).to(torch.uint8), ends - 4, 0 * views + 2, 0 * views + 2, has_transparency=True)
     depths = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
-    found = batch(Order(range(8), 8, 1), domain, store, depths, Order(range(2), 2, 1))
+    found = batch(Order(range(8), 8, 1), domain, store, None, depths, Order(range(2), 2, 1))
     number = 4 * found.pixels.view + 2 * found.pixels.y + found.pixels.x
     right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
     if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):
@@ -104,34 +110,6 @@ def _pixel(number, ends, across, views, left, top, slots, steps, valid, block: t
     return tl.load(views + low, mask=valid, other=0), x, within // side + tl.load(top + low, mask=valid, other=0)
 
 
-@triton.jit
-@no_type_check
-def _color(rgba, flat, valid):
-    """Return colors times alpha, and 255 times alpha."""
-    channel, inside = tl.arange(0, 4)[None, :], valid[:, None]
-    color = tl.load(rgba + 4 * flat[:, None] + channel, mask=inside, other=0).to(tl.int32)
-    alpha = tl.load(rgba + 4 * flat + 3, mask=valid, other=0).to(tl.int32)[:, None]
-    return alpha * tl.where(channel == 3, 255, color)
-
-
-@triton.jit
-@no_type_check
-def _share(offset, width, height, rgba, mask, view, x, y, valid, flat_share: tl.constexpr):
-    """Return in proportion to what pixels are chosen (`nerf.contrast.shares`)."""
-    begin, across = tl.load(offset + view, mask=valid, other=0), tl.load(width + view, mask=valid, other=1)
-    down = tl.load(height + view, mask=valid, other=1)
-    here = begin + y * across + x
-    color = _color(rgba, here, valid)
-    change = tl.abs(_color(rgba, begin + y * across + tl.minimum(x + 1, across - 1), valid) - color)
-    change += tl.abs(_color(rgba, begin + y * across + tl.maximum(x - 1, 0), valid) - color)
-    change += tl.abs(_color(rgba, begin + tl.minimum(y + 1, down - 1) * across + x, valid) - color)
-    change += tl.abs(_color(rgba, begin + tl.maximum(y - 1, 0) * across + x, valid) - color)
-    share = (tl.max(change, axis=1) + flat_share).to(tl.int64)
-    if mask is not None:
-        share = share * tl.load(mask + here, mask=valid, other=0).to(tl.int64)
-    return share
-
-
 @triton.jit(do_not_specialize=VARIES)
 @no_type_check
 def _batch(
@@ -139,9 +117,9 @@ def _batch(
     several, first, size, key, rows, columns, chooser,
     count, known_first, known_size, known_key, known_rows, known_columns,
     ends, across, views, left, top, slots, steps,
-    offset, width, height, rgba, mask,
+    offset, width, rgba, mask, shares,
     known_view, known_x, known_y, known_distance, known_certainty,
-    candidates: tl.constexpr, flat_share: tl.constexpr, rounds: tl.constexpr, block: tl.constexpr,
+    candidates: tl.constexpr, rounds: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     valid, is_known = index < count, index >= several
@@ -161,7 +139,9 @@ def _batch(
         for each in range(candidates):
             other = _number(place + each, size, rows, columns, key, numbered, rounds)
             view_of, x_of, y_of = _pixel(other, ends, across, views, left, top, slots, steps, numbered, block)
-            own = _share(offset, width, height, rgba, mask, view_of, x_of, y_of, numbered, flat_share)
+            flat = tl.load(offset + view_of, mask=numbered, other=0)
+            flat += y_of * tl.load(width + view_of, mask=numbered, other=0) + x_of
+            own = tl.load(shares + flat, mask=numbered, other=0).to(tl.int64)
             total += own
             word = mix((place + each).to(tl.uint32) ^ chooser.to(tl.uint32))
             taken = numbered & ((word >> 8).to(tl.int64) * total < (own << 24))

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cuda_backend
@@ -47,7 +47,12 @@ def has_kernel(device: torch.device) -> bool:
 
 
 def ordered_batch(
-    rays: Order, domain: Domain, store: PixelStore, depths: KnownDepths | None = None, of_known: Order = NOWHERE
+    rays: Order,
+    domain: Domain,
+    store: PixelStore,
+    shares: UInt8[Tensor, "pixels"] | None = None,
+    depths: KnownDepths | None = None,
+    of_known: Order = NOWHERE,
 ) -> Batch:
     """Return pixels at some places in the order of a domain, then some of those of known distance.
 
@@ -57,9 +62,10 @@ def ordered_batch(
         rays: places in the domain.
         domain: the numbered pixels.
         store: all pixels.
+        shares: by which one of the candidates is chosen (`nerf.contrast.shares`); needed if there are several.
         depths: pixels whose distance is known; None: no distances are needed.
         of_known: places among them.
     """
     kernels = cuda_backend("pixels.cuda", domain.ends.device)
     assert kernels is not None, "has_kernel is asked first"
-    return kernels.batch(rays, domain, store, depths, of_known)
+    return kernels.batch(rays, domain, store, shares, depths, of_known)
