@@ -13,10 +13,11 @@ from nerf_lightning.extensions.viewer.renderer import View
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
-COLOR = "color"
-PAPER, LINE = 237, 255
+COLOR, DEPTH = "Color", "Depth"  # As on exported pages.
+AROUND, LINE = 24, 255  # Gray levels: around a photograph, as on exported pages, and of the seam.
 # Depths are sent losslessly with every picture: more pixels per side take time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
 FARTHEST = 167.0  # viser sends depths as multiples of 1e-5 in three bytes: this is the maximum.
@@ -29,6 +30,18 @@ def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
     green and blue. Transparent parts fade to pale gray.
     """
     return to_bytes(CHANNELS[channel](view))
+
+
+def depth_scale(view: View, record: SceneRecord) -> str:
+    """Return the colors of a view's depths as HTML, with near and far in meters, or else in the capture's units."""
+    length = float(record.to_user[:3, 0].norm()) * (record.metres_per_unit or 1.0)
+    unit = "" if record.metres_per_unit is None else " m"
+    near, far = (f"{length * depth:.3g}{unit}" for depth in visible_range(view.depth, view.opacity))
+    bright_to_dark = to_bytes(color_map(torch.linspace(1, 0, 9)[None], 0.0, 1.0))[0].tolist()
+    colors = ", ".join(f"rgb({r} {g} {b})" for r, g, b in bright_to_dark)
+    ramp = f'<i style="flex:1;height:10px;border-radius:2px;background:linear-gradient(to right, {colors})"></i>'
+    line = f'<div style="display:flex;gap:8px;align-items:center">near {near} {ramp} far {far}</div>'
+    return f'<div style="padding:0 1em 0.5em;font-size:0.85em">{line}Pale gray: nothing is there</div>'
 
 
 def _depth(view: View) -> Float[Tensor, "height width 3"]:
@@ -49,9 +62,9 @@ def _rays(view: View, pixels: PixelIndex) -> RayBundle:
 
 CHANNELS: dict[str, Callable[[View], Tensor]] = {
     COLOR: lambda view: view.rgb,
-    "depth": _depth,
-    "opacity": lambda view: view.opacity[..., None].expand(-1, -1, 3),
-    "normals": _normals,
+    DEPTH: _depth,
+    "Opacity": lambda view: view.opacity[..., None].expand(-1, -1, 3),
+    "Normals": _normals,
 }
 
 
@@ -80,7 +93,7 @@ def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[
     beside = max(0, round(height * aspect) - width)
     above = max(0, round(width / aspect) - height)
     edges = (0, 0, beside // 2, beside - beside // 2, above // 2, above - above // 2)
-    return pad(picture, edges, value=PAPER)
+    return pad(picture, edges, value=AROUND)
 
 
 def planar_depth(view: View) -> Float[np.ndarray, "height width"]:

@@ -46,8 +46,8 @@ class ViewerClient:
         self.crop: CropBox | None = None
         self.photograph: int | None = None
         """The view whose camera is used."""
-        self.on_picture: Callable[[int, int, bool], None] = lambda height, width, finest: None
-        """Called after a picture is sent, with its size, and whether it is the finest."""
+        self.on_picture: Callable[[View, bool], None] = lambda view, finest: None
+        """Called after a picture is sent, with its view, and whether it is the finest."""
         self.on_finest: Callable[[], None] = lambda: None
         self.on_leave: Callable[[], None] = lambda: None
         self.on_move: Callable[[], None] = lambda: None
@@ -138,8 +138,7 @@ class ViewerClient:
     def _show(self, view: View, state: CameraState, finest: bool) -> None:
         self._last_view = view, state
         self._send(view, state)
-        height, width = view.opacity.shape
-        self.on_picture(height, width, finest)
+        self.on_picture(view, finest)
         if finest:
             self.on_finest()
 

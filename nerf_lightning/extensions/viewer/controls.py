@@ -1,17 +1,19 @@
 """The panel of the page: channels, photographs, the camera path, the crop box, snapshots, exports."""
 
 import math
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from nerf_lightning.extensions.viewer.channels import CHANNELS
+from nerf_lightning.extensions.viewer.channels import CHANNELS, DEPTH, depth_scale
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.extensions.viewer.export_panel import ExportPanel
 from nerf_lightning.extensions.viewer.frusta import Frusta
 from nerf_lightning.extensions.viewer.path_panel import PathPanel
 from nerf_lightning.extensions.viewer.photograph_panel import PhotographPanel
+from nerf_lightning.extensions.viewer.renderer import View
 from nerf_lightning.extensions.viewer.training_switch import TrainingPanel, TrainingSwitch
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.geometry.world_frame import points_to_user
@@ -20,6 +22,9 @@ from nerf_lightning.video.paths.recorded_path import RecordedPath, error_message
 from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
+STYLE = Path(__file__).parent / "panel.css"
+NARROW = 576  # Windows less wide (pixels) have viser's panel for phones.
+SAVE = "Save picture"  # Names are those of exported pages.
 LEAST_SHARE = 0.01  # The crop box keeps at least this share of the scene's box along each axis.
 NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
@@ -45,27 +50,33 @@ class Controls:
         self.path = RecordedPath(session.around, folder)
         self._wants_snapshot = False
         session.on_finest = self._keep_snapshot
-        self.status = self.gui.add_markdown("")
-        session.on_picture = self._say_size
-        if training is not None:
-            TrainingPanel(session, training)
-        self._add_view(min(max(float(round(math.degrees(fov))), LEAST_DEGREES), MOST_DEGREES))
-        self.photographs = PhotographPanel(session, self.frusta)
-        PathPanel(session, self.path, self.frusta)
-        self._add_crop()
-        if exports is not None:
-            ExportPanel(session, exports)
+        self.gui.add_html(f"<style>{STYLE.read_text(encoding='utf-8')}</style>")
+        # viser's panel cannot begin folded, and would cover half of a phone.
+        phone = session.client.camera.image_width < NARROW
+        with self.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext():
+            self.status = self.gui.add_markdown("")
+            session.on_picture = self._tell
+            if training is not None:
+                TrainingPanel(session, training)
+            self._add_view(min(max(float(round(math.degrees(fov))), LEAST_DEGREES), MOST_DEGREES))
+            self.photographs = PhotographPanel(session, self.frusta)
+            PathPanel(session, self.path, self.frusta)
+            self._add_crop()
+            if exports is not None:
+                ExportPanel(session, exports)
 
     def _add_view(self, degrees: float) -> None:
-        channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
+        channel = self.gui.add_dropdown("Shown", tuple(CHANNELS), initial_value=self.session.channel)
+        self.scale = self.gui.add_html("", visible=False)
         fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, degrees)
-        snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
+        snapshot = self.gui.add_button(SAVE, hint="Save the finest picture of this view as PNG")
 
         @channel.on_update
         @self.harmless
         def _(_: Any) -> None:
             self.session.channel = channel.value
             self.session.present()
+            self.scale.visible = channel.value == DEPTH
 
         @fov.on_update
         @self.harmless
@@ -100,7 +111,9 @@ class Controls:
         for each in (on, *sliders):
             each.on_update(self.harmless(update))
 
-    def _say_size(self, height: int, width: int, finest: bool) -> None:
+    def _tell(self, view: View, finest: bool) -> None:
+        height, width = view.opacity.shape
+        self.scale.content = depth_scale(view, self.session.photographs.record)
         said = f"{width} x {height} pixels{'' if finest else ', refining'}"
         if said != self.status.content:
             self.status.content = said
@@ -114,9 +127,9 @@ class Controls:
             with new_file(self.folder, "snapshot", ".png") as path:
                 save_png(path, picture)
         except OSError as error:  # no click ends a training
-            self.session.client.add_notification("Snapshot", error_message(error), color="red")
+            self.session.client.add_notification(SAVE, error_message(error), color="red")
         else:
-            self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+            self.session.client.add_notification(SAVE, f"Saved as {path}", auto_close_seconds=10.0)
 
 
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:

@@ -4,6 +4,7 @@ viser itself checks neither Origin nor Host, and has no token. It serves through
 that, but viser passes no such arguments. So `serve` is replaced while viser starts.
 """
 
+import gzip
 import logging
 import re
 import secrets
@@ -15,6 +16,7 @@ from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_html
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -25,6 +27,7 @@ LOCAL = ("127.0.0.1", "localhost", "[::1]")
 # A machine's name or address, optionally with a port.
 HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::[0-9]{1,5})?")
 LONGEST_PATH = 2000
+VISERS_TITLE = b"<title>Viser</title>"
 NO_TOKEN = "The access token is missing: open the whole address that nerf printed, with ?token=..."
 # viser's page embeds its scripts and styles, unpacks itself with WebAssembly, and makes workers and pictures from
 # blobs. Older browsers do not treat the page's own socket as 'self'.
@@ -98,8 +101,8 @@ class Auth:
         return f"nerf_lightning_{port}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
 
-def guarded_server(auth: Auth, port: int) -> "ViserServer":
-    """Start viser's server behind the guard; refuse a version of it that cannot be guarded."""
+def guarded_server(auth: Auth, port: int, title: str = "nerf view") -> "ViserServer":
+    """Start viser's server behind the guard, its page titled `title`; refuse a version that cannot be guarded."""
     from viser import ViserServer
     from websockets.asyncio import server as websockets_server
 
@@ -107,7 +110,7 @@ def guarded_server(auth: Auth, port: int) -> "ViserServer":
 
     def guarded_serve(*where: Any, process_request: Callable[..., "Response | None"], **options: Any) -> Any:
         guarded.append(where)
-        answer = partial(_answer, auth, process_request)
+        answer = partial(_answer, auth, process_request, title)
         return serve(*where, process_request=answer, logger=unheard, server_header=None, **options)
 
     websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]
@@ -125,8 +128,26 @@ def guarded_server(auth: Auth, port: int) -> "ViserServer":
     return server
 
 
+def _entitle(response: "Response", title: str) -> None:
+    """Give viser's page a title, for which it has no setting."""
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    body = response.body
+    if not response.headers.get("Content-Type", "").startswith("text/html") or not body:
+        return
+    page = gzip.decompress(body) if packed else body
+    page = page.replace(VISERS_TITLE, f"<title>{for_html(title)}</title>".encode(), 1)
+    response.body = gzip.compress(page) if packed else page
+    if "Content-Length" in response.headers:
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
+
+
 def _answer(
-    auth: Auth, viser: Callable[..., "Response | None"], connection: "ServerConnection", request: "Request"
+    auth: Auth,
+    viser: Callable[..., "Response | None"],
+    title: str,
+    connection: "ServerConnection",
+    request: "Request",
 ) -> "Response | None":
     refusal, host = auth.refusal(request), ""
     try:
@@ -135,6 +156,7 @@ def _answer(
         response = connection.respond(HTTPStatus.BAD_REQUEST, "This is not a request for a page.\n")
     if response is not None:
         if refusal is None:
+            _entitle(response, title)
             host = request.headers["Host"]
             response.headers["Set-Cookie"] = auth.cookie(connection.local_address[1])
         response.headers.update(HEADERS | {"Content-Security-Policy": POLICY.format(host=host)})

@@ -63,9 +63,9 @@ class Page:
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages may be closed while a picture is being sent; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self.server = guarded_server(auth, free_port(auth.host, port))
-        # viser has no way to set the title of the browser's tab.
-        self.server.gui.set_panel_label(record.name if run is None else _title(record.name, run))
+        title = record.name if run is None else _title(record.name, run)
+        self.server = guarded_server(auth, free_port(auth.host, port), title)
+        self.server.gui.set_panel_label(title)
         self._dress(record)
         self.server.on_client_connect(queue.errors.harmless(self._welcome))
         self.server.on_client_disconnect(queue.errors.harmless(lambda client: queue.remove(client.client_id)))

@@ -15,7 +15,7 @@ from nerf_lightning.messages.escaping import as_code
 from nerf_lightning.video.paths.recorded_path import USUAL_SECONDS, RecordedPath, error_message, keyframe_of
 
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600.0
-PLAY, STOP = "Play", "Stop"
+PLAY, STOP = "Play", "Pause"
 NO_FILES, NOTHING = "none yet", "No keyframes yet."
 PER_SECOND = 12  # Views per second while a path is played: faster than coarse pictures arrive would only queue.
 
@@ -38,10 +38,10 @@ class PathPanel:
             self.delete = gui.add_button("Delete keyframe", visible=False)
             self.line = gui.add_slider("Time", 0.0, 1.0, 0.01, 0.0, visible=False)
             self.play = gui.add_button(PLAY, visible=False, hint="Play the path in this page")
-            self.save = gui.add_button("Save as yaml", visible=False)
+            self.save = gui.add_button("Save path", visible=False)
             hint = f"The keyframe files in {self.path.folder}: put others there to load them"
-            self.file = gui.add_dropdown("Saved", (NO_FILES,), hint=hint)
-            load = gui.add_button("Load", hint="Replace the current keyframes")
+            self.file = gui.add_dropdown("Saved paths", (NO_FILES,), hint=hint)
+            self.load = gui.add_button("Load path", hint="Replace the current keyframes")
             self.said = gui.add_markdown(NOTHING)
         add.on_click(self._act(self._add))
         self.number.on_update(self._act(self._choose))
@@ -50,7 +50,7 @@ class PathPanel:
         self.line.on_update(self._act(self._scrub))
         self.play.on_click(self._act(self._play))
         self.save.on_click(self._act(self._save))
-        load.on_click(self._act(self._load))
+        self.load.on_click(self._act(self._load))
         self._refresh()
 
     def _act(self, act: Callable[[], None]) -> Callable[[Any], None]:
@@ -143,6 +143,7 @@ class PathPanel:
 
     def _list_files(self) -> None:
         names = tuple(self.path.files()) or (NO_FILES,)
+        self.load.disabled = names == (NO_FILES,)
         if names != tuple(self.file.options):
             kept = self.file.value if self.file.value in names else names[0]
             self.file.options, self.file.value = names, kept

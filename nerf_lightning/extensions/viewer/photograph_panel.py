@@ -24,10 +24,10 @@ class PhotographPanel:
         labels = [f"{view}: {name}" if count[name] > 1 else name for view, name in enumerate(short)]
         with gui.add_folder("Photographs", expand_by_default=False):
             visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
-            self.choice = gui.add_dropdown("View from", (NONE, *labels), initial_value=NONE)
+            self.choice = gui.add_dropdown("Photograph", (NONE, *labels), initial_value=NONE)
             self.name = gui.add_markdown("", visible=False)
             self.split = gui.add_slider(
-                "Photograph | render", 0.0, 1.0, 0.01, session.split, visible=False, hint="Left is the photograph"
+                "Photograph | Render", 0.0, 1.0, 0.01, session.split, visible=False, hint="Left is the photograph"
             )
             self.leave = gui.add_button("Leave photograph", visible=False)
         visible.on_update(harmless(lambda _: self.frusta.show(visible.value)))

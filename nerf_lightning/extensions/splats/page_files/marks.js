@@ -177,11 +177,11 @@ function asked(question, value) {
   const [dialog, name] = ["naming", "name"].map(byId);
   byId("asked").textContent = question;
   name.value = value;
-  byId("cancel").onclick = () => dialog.close("");
-  dialog.returnValue = "";
+  byId("cancel").onclick = () => dialog.close();
   dialog.showModal();
   name.select();
   return new Promise((found) => {
-    dialog.onclose = () => found(dialog.returnValue === "save" ? name.value : null);
+    name.form.onsubmit = () => found(name.value);
+    dialog.onclose = () => { if (!dialog.open) found(null); };  // open: it asks the next question
   });
 }

@@ -230,6 +230,7 @@ function place({ view, turning }) {
   for (const [name, pixels] of Object.entries(edges)) around.style.setProperty(`--${name}`, `${pixels}px`);
   for (const [name, pixels] of Object.entries(box)) frame.style[name] = `${pixels}px`;
   frame.style.setProperty("--at", `${byId("wipe").value}%`);
+  byId("seam").hidden = ["0", "100"].includes(byId("wipe").value);
   if (source && photograph.src !== source) photograph.src = source;
 }
 

@@ -2,10 +2,12 @@
 
 import re
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.viewer_panel import Panel
@@ -17,11 +19,22 @@ from nerf_lightning.messages.escaping import as_code, for_terminal
 
 def snapshot(panel):
     """Click, wait for the picture, and return what the page says."""
-    panel.press("Snapshot")
+    panel.press("Save picture")
     panel.work()
     (title, text), _ = panel.client.add_notification.call_args
-    assert title == "Snapshot"
+    assert title == "Save picture"
     return text
+
+
+def seen(panel, height, width):
+    """A view of this size, everything in which is three units away."""
+    last, _ = panel.session._last_view
+    return replace(
+        last,
+        rgb=torch.ones(height, width, 3),
+        depth=torch.full((height, width), 3.0),
+        opacity=torch.ones(height, width),
+    )
 
 
 def test_a_snapshot_makes_its_folder_and_says_where_it_is(tmp_path):
@@ -35,10 +48,28 @@ def test_a_snapshot_makes_its_folder_and_says_where_it_is(tmp_path):
 
 def test_the_size_of_the_picture_is_on_the_panel():
     panel = Panel(Path())
-    panel.session.on_picture(6, 8, False)
+    panel.work()
+    panel.session.on_picture(seen(panel, 6, 8), False)
     assert panel.controls.status.content == "8 x 6 pixels, refining"
+    panel.session.refinement.refresh()
     panel.work()
     assert panel.controls.status.content == "16 x 12 pixels"
+
+
+def test_the_scale_of_depths_is_shown_with_them_in_the_captures_units():
+    panel = Panel(
+        Path(), to_user=torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64)), metres_per_unit=0.5
+    )
+    assert not panel.controls.scale.visible
+    panel.set("Shown", "Depth")
+    assert panel.controls.scale.visible
+    panel.work()
+    panel.session.on_picture(seen(panel, 2, 2), True)
+    assert "near 3 m" in panel.controls.scale.content
+
+
+def test_on_phones_the_panel_begins_folded(tmp_path):
+    assert "Controls" in Panel(tmp_path).gui.made  # its window is 16 pixels wide
 
 
 def test_a_full_disk_is_said_and_ends_nothing(tmp_path, monkeypatch):
@@ -61,7 +92,7 @@ def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):
     panel = Panel(tmp_path)
     monkeypatch.setattr(panel.session, "enter", lambda view: 1 / 0)
     for _ in range(3):
-        panel.set("View from", "ball_0")
+        panel.set("Photograph", "ball_0")
     assert caplog.text.count("ZeroDivisionError") == 1
     assert "Traceback" not in caplog.text
 

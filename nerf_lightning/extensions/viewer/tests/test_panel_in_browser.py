@@ -55,6 +55,7 @@ def test_a_person_makes_a_path_plays_it_films_it_and_chooses_a_photograph(tmp_pa
         # The whole photograph is in a window that is narrower than it.
         assert math.tan(math.radians(shown) / 2) * width / height == pytest.approx(math.tan(PHOTOGRAPH / 2), rel=0.03)
 
+        unfold(browser, "Controls", "//*[text()='Camera path']")  # the window is narrow
         unfold(browser, "Camera path", "//*[text()='Add keyframe']")
         for _ in range(2):
             button(browser, "Add keyframe")
@@ -66,12 +67,12 @@ def test_a_person_makes_a_path_plays_it_films_it_and_chooses_a_photograph(tmp_pa
         button(browser, "Play")
         wait(lambda: 0.2 < (number(browser, "Time") or 0) < 1.9)
         wait(lambda: number(browser, "Time") == 2.0)
-        button(browser, "Save as yaml")
+        button(browser, "Save path")
         wait(lambda: "path.file=" in text(browser))
         button(browser, "Camera path")
 
-        unfold(browser, "Photographs", "//*[text()='View from']")
-        press(browser, "xpath", "//*[text()='View from']/following::input[1]")
+        unfold(browser, "Photographs", "//*[text()='Photograph']")
+        press(browser, "xpath", "//*[text()='Photograph']/following::input[1]")
         press(browser, "xpath", "//*[@role='option'][2]")
         wait(lambda: f"Camera of {NAME}" in text(browser))
-        assert browser.title == "Viser"  # an untrusted name is text
+        assert browser.title == "ball"  # an untrusted name is text

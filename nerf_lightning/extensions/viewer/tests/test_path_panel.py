@@ -53,12 +53,12 @@ def test_playing_goes_along_the_path_hides_what_is_drawn_and_ends(panel, monkeyp
     overlay = panel.controls.frusta.root
     panel.press("Play")
     assert overlay.visible is False
-    assert panel.gui.made["Play"].label == "Stop"
+    assert panel.gui.made["Play"].label == "Pause"
     panel.wait(lambda: panel.gui.made["Play"].label == "Play")
     assert panel.gui.made["Time"].value == pytest.approx(2.1)
     assert panel.client.camera.position.tolist() == pytest.approx([6.0, 0.0, 2.0])
     panel.wait(lambda: overlay.visible)
-    for label in ("Stop", "Play"):
+    for label in ("Pause", "Play"):
         panel.press("Play")
         assert panel.gui.made["Play"].label == label
 
@@ -92,22 +92,24 @@ def test_content_hides_what_is_drawn_behind_it(tmp_path):
 
 
 def test_a_saved_path_is_listed_and_loaded(panel, tmp_path):
-    panel.press("Save as yaml")
+    assert panel.gui.made["Load path"].disabled  # nothing was saved
+    panel.press("Save path")
     assert "` path=keyframes path.file=" in panel.said()
-    assert panel.gui.made["Saved"].options == ("camera_path_001.yaml",)
+    assert panel.gui.made["Saved paths"].options == ("camera_path_001.yaml",)
+    assert not panel.gui.made["Load path"].disabled
     (tmp_path / "viewer" / "bad.yaml").write_text("- {position: [0, 0, 1]}\n")
     panel.press("Delete keyframe")
-    panel.press("Load")
+    panel.press("Load path")
     assert places(panel) == [4.0, 5.0, 6.0]
-    panel.set("Saved", "bad.yaml")
-    panel.press("Load")
+    panel.set("Saved paths", "bad.yaml")
+    panel.press("Load path")
     assert "must have a position" in panel.said()
     assert places(panel) == [4.0, 5.0, 6.0]
 
 
 def test_a_place_that_cannot_be_written_is_said(panel, tmp_path):
     (tmp_path / "viewer").write_text("")
-    panel.press("Save as yaml")
+    panel.press("Save path")
     assert "It could not be saved: [Errno 17] File exists" in panel.said()
 
 
@@ -115,5 +117,5 @@ def test_a_folders_name_is_no_markup(tmp_path):
     panel = Panel(tmp_path / "<script>")
     for _ in range(2):
         panel.press("Add keyframe")
-    panel.press("Save as yaml")
+    panel.press("Save path")
     assert panel.said().endswith(f"` path=keyframes path.file={tmp_path}/<script>/camera_path_001.yaml `")

@@ -5,7 +5,7 @@ from unittest.mock import MagicMock
 from support.scenes import ball_scene
 from support.viewer_panel import Panel
 
-CHOICE, SPLIT = "View from", "Photograph | render"
+CHOICE, SPLIT = "Photograph", "Photograph | Render"
 
 
 def test_a_photograph_is_chosen_by_its_name_looked_through_and_left(tmp_path):

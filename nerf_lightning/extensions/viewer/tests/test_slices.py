@@ -146,11 +146,11 @@ def plane():
 
 
 def test_every_channel_has_the_views_size_and_shows_what_it_is(plane):
-    picture = picture_of(plane, "normals")
+    picture = picture_of(plane, "Normals")
     assert picture[6, 6].tolist() == pytest.approx([128, 255, 128], abs=1)
-    assert picture_of(plane, "color")[0, 0].tolist() == [128, 128, 128]
-    assert picture_of(plane, "opacity").min() == 255
-    picture = picture_of(plane, "depth").float().sum(dim=-1)
+    assert picture_of(plane, "Color")[0, 0].tolist() == [128, 128, 128]
+    assert picture_of(plane, "Opacity").min() == 255
+    picture = picture_of(plane, "Depth").float().sum(dim=-1)
     assert picture[6, 6] > picture[0, 0]
     assert {tuple(picture_of(plane, channel).shape) for channel in CHANNELS} == {(12, 12, 3)}
 
