@@ -277,14 +277,6 @@ return [...faults, ...boxes.filter(box => wide(box) || cut(box)).map(box => box.
 """
 
 
-@pytest.mark.minutes
-@pytest.mark.parametrize("page", ["method", "course_2_rays"])
-def test_formulas_wrap_or_scroll_in_their_own_boxes_on_phones(site, page):
-    with opened((site / f"{page}.html").as_uri()) as driver:
-        layout_faults(driver, "phone")
-        assert driver.execute_script(FORMULAS) == []
-
-
 WIDE_TABLES = """
 return [...document.querySelectorAll("table.docutils")]
     .filter(table => table.scrollWidth > table.parentElement.clientWidth).map(table => table.textContent.slice(0, 60));
@@ -292,12 +284,15 @@ return [...document.querySelectorAll("table.docutils")]
 
 
 @pytest.mark.minutes
-@pytest.mark.parametrize("page", ["settings", "article", "capture_formats", "measurements"])
-def test_tables_fit_into_the_page(site, page):
-    with opened((site / f"{page}.html").as_uri()) as driver:
-        for size in ("desktop", "phone"):
-            layout_faults(driver, size)
-            assert driver.execute_script(WIDE_TABLES) == [], size
+def test_tables_fit_into_the_page_and_formulas_wrap_or_scroll_in_their_own_boxes(site):
+    with opened((site / "index.html").as_uri()) as driver:
+        for page in ("settings", "article", "capture_formats", "measurements", "method", "course_2_rays"):
+            driver.get((site / f"{page}.html").as_uri())
+            for size in ("desktop", "phone"):
+                layout_faults(driver, size)
+                assert driver.execute_script(WIDE_TABLES) == [], (page, size)
+            if page in ("method", "course_2_rays"):
+                assert driver.execute_script(FORMULAS) == [], page
 
 
 SMALLER = (
@@ -335,12 +330,14 @@ def test_every_notebook_is_tested():
     assert {path.stem for path in (REPOSITORY / "docs").glob("*.ipynb")} == AT_THE_END.keys()
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize("name", AT_THE_END)
 def test_a_notebook_runs_from_top_to_bottom(name, tmp_path):
     output = what_prints([*code_cells(name), AT_THE_END[name]], tmp_path)
     assert {said: output.count(said) for said in SAID[name]} == SAID[name]
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize("name", [name for name in SAID if "correct: " in SAID[name]])
 def test_a_wrong_solution_of_an_exercise_fails_with_the_equation_to_read(name, tmp_path):
     wrong = re.findall(r"^wrong: .*", what_prints(with_wrong_solutions(code_cells(name)), tmp_path), flags=re.MULTILINE)

@@ -2,7 +2,6 @@
 
 import csv
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -10,9 +9,8 @@ import time
 
 import pytest
 from support import other_systems
-from support.captures import real_capture, write_npz
+from support.captures import write_npz
 from support.command_fixtures import *  # noqa: F403
-from support.ports import unused_port
 from support.running import FAST, FAST_SWEEP, REPOSITORY, finished, saved, start_cold
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux stands in for the others")
@@ -48,33 +46,8 @@ def test_the_main_commands_do_their_work(system, tmp_path):
 
 
 @pytest.mark.minutes
-@pytest.mark.data
-def test_photographs_without_cameras_become_a_film_on_windows(tmp_path):
-    pytest.importorskip("pycolmap")
-    photographs = f"scene=photos scene.root={real_capture('kermit')} scene.cache_dir={tmp_path}/cache scene.longest=64"
-    run("win32", tmp_path, f"train {photographs} {' '.join(FAST)} paths.output_dir={tmp_path}/run")
-    assert (tmp_path / "run" / "video.mp4").stat().st_size > 0
-    assert (tmp_path / "run" / "report.html").stat().st_size > 0
-
-
-@pytest.mark.minutes
-def test_the_page_shows_pictures_until_ctrl_c_on_windows(finished_run, tmp_path):
-    client = pytest.importorskip("support.viser_client")
-    options = f"port={unused_port()}", f"paths.output_dir={tmp_path}"
-    env = other_systems.environment("win32", tmp_path)
-    process = start_cold("nerf_lightning", "view", f"ckpt={finished_run}", *options, env=env)
-    address = next(found[1] for line in process.stdout if (found := re.search(r"The page is at (http://\S+)", line)))
-    client = client.ViserClient(address)
-    client.look_from(0)
-    client.wait_for(len)
-    process.send_signal(signal.SIGINT)
-    code, output = finished(process)
-    assert (code, "Traceback" in output) == (0, False), output
-
-
-@pytest.mark.minutes
 def test_parallel_jobs_save_when_they_are_stopped_on_windows(capture, tmp_path):
-    """The stop file alone tells them: SIGTERM would end them at once. On macOS signals do, as in test_sweeps.py."""
+    """The stop file alone tells them: SIGTERM would end them at once."""
     env = other_systems.environment("win32", tmp_path)
     jobs = (*FAST_SWEEP, "hydra/launcher=parallel", "seed=0,1,2", "final.video=false", "trainer.max_steps=100000")
     words = ("train", "-m", "scene=npz", f"scene.path={capture}", *jobs, f"paths.output_dir={tmp_path}/sweep")

@@ -4,10 +4,12 @@ import json
 import shutil
 
 import numpy as np
+import pytest
 from support.posed_captures import Known, ring, write_colmap
 from support.running import FAST, done, said
 
 
+@pytest.mark.minutes
 def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(nerf, capture, tmp_path):
     """What is named of each change: tests/checkpoints/test_same_capture.py."""
     shutil.copy(capture, tmp_path / "ball.npz")

@@ -1,13 +1,10 @@
 import os
-import sys
 
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 from support.configs import yaml_files
 from support.running import said
 
-from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.hydra_versions import IS_1_3
 
@@ -42,31 +39,6 @@ def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
 of_1_3 = pytest.mark.skipif(
     not IS_1_3, reason="Hydra 1.4 looks for the mode in the command line and the main yaml only"
 )
-
-
-@pytest.fixture
-def compositions(monkeypatch):
-    """How often Hydra composed a config."""
-    times, load = [], ConfigLoaderImpl.load_configuration
-
-    def counted(*given, **named):
-        times.append(1)
-        return load(*given, **named)
-
-    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
-    return times
-
-
-@of_1_3
-@pytest.mark.parametrize(("more", "times"), [((), 1), (("hydra.mode=RUN",), 2), (("--config-dir={}",), 2)])
-def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_users(
-    compositions, tmp_path, monkeypatch, capsys, more, times
-):
-    arguments = ["report", f"paths.output_dir={tmp_path}", f"run={tmp_path}", *more]
-    monkeypatch.setattr(sys, "argv", ["nerf", *(each.format(tmp_path) for each in arguments)])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert len(compositions) == times, capsys.readouterr()
 
 
 @of_1_3

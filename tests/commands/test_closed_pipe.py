@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from support.running import FAST_SWEEP, start
+from support.running import start
 
 from nerf_lightning.cli.process import ends_quietly
 from nerf_lightning.messages.exit_codes import READER_LEFT
@@ -36,17 +36,6 @@ def test_a_command_that_nobody_reads_ends_without_a_word(capture, tmp_path):
     assert code == READER_LEFT, told
     assert "Traceback" not in told
     assert "Broken pipe" not in told
-
-
-@pytest.mark.slow
-def test_a_sweep_that_nobody_reads_stops_and_can_be_gone_on_with(capture, tmp_path):
-    quick = (*FAST_SWEEP, "logger=none", "final.video=false", f"paths.output_dir={tmp_path}")
-    code, told = unread("train", "-m", "scene=npz", f"scene.path={capture}", *quick, "seed=0,1")
-    assert code == READER_LEFT, told
-    assert "Traceback" not in told
-    assert "Broken pipe" not in told
-    assert "stopped" in (tmp_path / ".hydra" / "jobs" / "0.json").read_text()
-    assert not (tmp_path / "1_seed=1").exists()
 
 
 def test_bad_input_is_told_though_nobody_reads_stdout():

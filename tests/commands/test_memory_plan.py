@@ -79,6 +79,7 @@ def test_a_short_run_does_not_measure(steps, measured, train, monkeypatch):
     assert asked == measured
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize(
     ("length", "line"),
     [

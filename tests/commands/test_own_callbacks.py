@@ -60,12 +60,3 @@ def test_a_class_that_is_no_callback_or_not_there_is_told(train, my_package, tmp
     monkeypatch.syspath_prepend(tmp_path)
     said(train("+callbacks.mine._target_=my_package.Missing"), "callbacks.mine", "Missing")
     assert not (tmp_path / "run").exists()
-
-
-def test_flags_of_lightnings_need_no_plus(train, tmp_path):
-    result = done(train("trainer.lightning.profiler=simple", "trainer.lightning.limit_val_batches=1"))
-    table = tmp_path / "run" / "fit-profile.txt"
-    assert f"profile: {table}" in result.err
-    assert "run_training_batch" in table.read_text()
-    result = train("resume=auto", "trainer.max_steps=5")  # the same run, looked at in another way
-    assert result.code == 0, result.err

@@ -30,7 +30,6 @@ def content(folder):
     "command",
     [
         ("render", "format=frames", *RENDER),
-        ("export", "what=cameras"),
         ("export", "what=images", "what.max_views=1"),
         ("eval", "evaluation.max_views=1", "evaluation.num_pictures=1"),
     ],

@@ -12,8 +12,6 @@ from support.mutations import mutated
 from support.resumed import Resumed
 from support.running import FAST_PATH, refused
 
-from nerf_lightning.checkpoints import reading
-
 
 @pytest.fixture(scope="module")
 def resume(stopped, capture, tmp_path_factory):
@@ -114,17 +112,6 @@ def test_a_sound_one_is_taken(resume, resume_fast, caplog):
     resume_fast(lambda content: None)
     resume(at(OURS, "num_threads", value=(os.cpu_count() or 1) + 1))  # more than there are cores
     assert "may differ in the last bits" in caplog.text
-
-
-def test_a_resume_reads_its_file_once(stopped, monkeypatch):
-    path, reads, real = stopped / "checkpoints" / "last.ckpt", [], reading.load_tensors
-    monkeypatch.setattr(reading, "load_tensors", lambda file: reads.append(file) or real(file))
-    assert reading.newest_checkpoint(path.parent, to_resume=True).step == 12
-    assert reading.content_to_resume(path)["global_step"] == 12
-    assert reads == [path]
-    os.utime(path)  # whoever asks again, or of another file, reads
-    assert reading.content_to_resume(path)["global_step"] == 12
-    assert len(reads) == 2
 
 
 @fuzzed(40)

@@ -106,6 +106,7 @@ def test_heic_beside_its_copy_is_passed_over_and_panoramas_are_left_out(poses, p
     assert "No camera could be placed: the 3 pictures" in result.err
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize(
     ("pictures", "blur", "why"),
     [
@@ -126,6 +127,7 @@ def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, pictures, 
     refused(result, tmp_path, "no camera could be placed for the 4 frames", why, "Film again")
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_of_photographs_of_two_places_the_larger_part_is_taken_and_the_other_named(poses, tmp_path):
     folder = tmp_path / "given"
@@ -169,6 +171,7 @@ def test_the_cameras_of_a_known_scene_are_found(poses, tmp_path):
     assert degrees.max() < 0.5
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_photographs_left_out_are_named(poses, tmp_path):
     """Four views of the corner, two of them cut narrower, and three pictures of nothing."""

@@ -1,15 +1,13 @@
 """The stamp on every number: what it holds, what changes it, and what keeps two results apart."""
 
 import json
-import subprocess
 
 import pytest
 import torch
 from support.scenes import ball_scene, tiny_model
 
 from nerf_lightning import __version__
-from nerf_lightning.evaluation import protocol
-from nerf_lightning.evaluation.protocol import commit, config_hash, differences, measured_how, measured_of, weights_hash
+from nerf_lightning.evaluation.protocol import config_hash, differences, measured_how, measured_of, weights_hash
 
 MEASURED = {"scene": "a", "split": "test", "background": "white", "pixels": "float", "lpips": None}
 
@@ -69,21 +67,6 @@ def test_what_keeps_two_results_apart_is_named():
     assert differences(MEASURED | {"lpips": "alex"}, MEASURED | {"lpips": "vgg"}) == ["lpips: alex and vgg"]
     other = MEASURED | {"scene": "b", "background": "black", "pixels": "8-bit"}
     assert differences(MEASURED, other, same_scene=False) == ["pixels: float and 8-bit"]
-
-
-def test_the_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
-    monkeypatch.setattr(protocol, "REPOSITORY", tmp_path)
-    assert commit() is None
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run([*git, "init", "-q"], check=True)
-    (tmp_path / "file").write_text("one")
-    subprocess.run([*git, "add", "file"], check=True)
-    subprocess.run([*git, "commit", "-q", "-m", "one"], check=True)
-    clean = commit()
-    assert clean is not None
-    assert len(clean) == 12
-    (tmp_path / "file").write_text("two")
-    assert commit() == f"{clean}-dirty"
 
 
 def test_metrics_have_median_worst_speed_and_pictures_of_the_worst(finished_run):

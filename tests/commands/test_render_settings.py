@@ -8,7 +8,6 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from support.known_fields import INSIDE, solid
 from support.peak_bytes import peak_bytes
 from support.running import FAST, done, said
 from support.scenes import ball_scene, tiny_field
@@ -18,26 +17,15 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
-from nerf_lightning.nerf.geometry.world_frame import (
-    points_from_user,
-    points_to_user,
-    poses_from_user,
-    similarity,
-    unit_of,
-)
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.video.film import bytes_per_pixel, film, require_room
-from nerf_lightning.video.paths.keyframe_path import KeyframePath
-from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.settings import FilmSettings
-from nerf_lightning.video.shots import Subject, make_shots
+from nerf_lightning.video.shots import Subject
 
-# Takes x to y, y to z and z to x: boxes stay boxes.
-CYCLE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 SMALL = ("path=orbit", "path.num_frames=2", "path.width=12", "trainer.tile_points=8192")
 
 
@@ -129,57 +117,6 @@ def test_a_model_of_one_level_has_no_difference_of_levels(tmp_path):
     with pytest.raises(InputError, match=r"this model renders one level.*model=nerf"):
         film([subject], Orbit(2), 1000, tmp_path, settings)
     assert not list(tmp_path.iterdir())
-
-
-def in_frame(first, to_user):
-    """The same capture as another reader would have it: moved, turned by whole axes and scaled."""
-    unit = unit_of(to_user)
-    corners = points_from_user(first.aabb.double(), to_user).float()
-    return replace(
-        first,
-        to_user=to_user,
-        cameras=replace(first.cameras, c2w=poses_from_user(first.cameras.c2w.double(), to_user).float()),
-        near=first.near / unit,
-        far=first.far / unit,
-        aabb=torch.stack([corners.amin(dim=0), corners.amax(dim=0)]),
-    )
-
-
-def egg_in(to_user):
-    """A model of what is there in the user's frame, wherever it was learned: no two of its axes look alike."""
-
-    def distance(positions):
-        stretched = points_to_user(positions, to_user.float()) / torch.tensor([0.9, 0.6, 0.4])
-        return 0.4 * (stretched.norm(dim=-1) - 1)
-
-    def color(positions):
-        return (0.5 + 0.5 * points_to_user(positions, to_user.float())).clamp(0, 1)
-
-    return solid(distance, color=color, inside=INSIDE * unit_of(to_user))
-
-
-def test_models_with_other_working_frames_show_the_same_thing(tmp_path):
-    """A capture that was read otherwise has another working frame: the path is the first one's, seen from there."""
-    user, first_frame = scene_record(ball_scene()), similarity(CYCLE.mT, torch.tensor([0.0, -1.0, 0.5]), 0.5)
-    other_frame = similarity(CYCLE, torch.tensor([1.0, 2.0, 3.0]), 2.5)
-    ends = ((4.0, 0.0, 1.0), (0.0, 4.0, 1.0))
-    write_keyframes(tmp_path / "keys.yaml", [Keyframe(end, look_at=(0.0, 0.0, 0.0)) for end in ends])
-    path = KeyframePath(str(tmp_path / "keys.yaml"), 3, width=24)
-    subjects = [Subject(egg_in(each), in_frame(user, each), "white") for each in (first_frame, other_frame)]
-    one, two = make_shots(subjects, path, 1 << 15)
-    seen = poses_from_user(one.cameras.c2w.double(), torch.linalg.inv(first_frame))
-    torch.testing.assert_close(
-        seen[:, :, 3], torch.tensor([[4.0, 0.0, 1.0], [2.0, 2.0, 1.0], [0.0, 4.0, 1.0]]).double()
-    )
-    torch.testing.assert_close(two.cameras.c2w.double(), poses_from_user(seen, other_frame))
-    for number in range(3):
-        here, there = one.picture(number), two.picture(number)
-        assert 0.03 < float(here.opacity.mean()) < 0.5
-        torch.testing.assert_close(here.rgb, there.rgb, atol=0.02, rtol=0)
-        hit = here.opacity > 0.99
-        torch.testing.assert_close(one.unit * here.depth[hit], two.unit * there.depth[hit], atol=0.02, rtol=0)
-        turned = one.normals(number, here)[hit] - two.normals(number, there)[hit]
-        assert float(turned.abs().mean()) < 0.02
 
 
 def test_panoramas_show_what_their_faces_show(last, rendered):

@@ -172,21 +172,3 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
     assert "resuming from step" in output
     assert len(list(root.rglob("run.json"))) == 1
     assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 70
-
-
-@pytest.mark.exhaustive
-@POSIX
-def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path):
-    folder = tmp_path / "sweep"
-    process = begin(
-        capture, tmp_path, "-m", "hydra/launcher=slurm_here", "seed=0", "hydra.sweep.dir=" + str(folder),
-        "hydra.launcher.timeout_min=10",
-    )  # fmt: skip
-    run = saved_below(folder, 10, process)
-    record = json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())
-    os.kill(record["process"], signal.SIGUSR2)
-    output_of(process)
-    (log,) = folder.glob(".submitit/*/*_log.err")
-    assert "resuming from step" in log.read_text()
-    assert json.loads((run / "run.json").read_text())["finished_at_step"] == 70
-    assert json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())["state"] == "finished"

@@ -11,10 +11,9 @@ from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
-from nerf_lightning.config.setting_rules import fingerprint
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.identity import run_identity, settings_digest
+from nerf_lightning.runs.identity import settings_digest
 from nerf_lightning.runs.run_folder import ResumePoint, open_run, write_config
 
 HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}
@@ -91,21 +90,6 @@ def test_a_run_that_is_older_than_a_setting_goes_on_with_its_default(tmp_path, c
     assert begin(config(tmp_path, here, "resume=auto")).path == tmp_path / "here"
 
 
-@pytest.mark.parametrize("lost", [(), ("model.subpixels",)])
-def test_a_run_of_a_version_that_counted_the_budget_to_it_goes_on(tmp_path, lost):
-    here = f"paths.output_dir={tmp_path}/here"
-    older = without(config(tmp_path, here, "budget.seconds=60"), *lost)
-    run = begin(older)
-    run.note(fingerprint=fingerprint(run_identity(older) | {"budget.seconds": 60}))
-    run.release()
-    begin(config(tmp_path, f"resume={tmp_path}/here", "budget.seconds=300")).release()
-    with pytest.raises(InputError, match=r"other settings \(seed: there 0, here 3"):
-        open_run(config(tmp_path, f"resume={tmp_path}/here", "seed=3"), 100, None)
-    run.note(fingerprint="of a config that was changed by hand")
-    with pytest.raises(InputError, match="contains a run with other settings"):
-        open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
-
-
 def test_a_setting_that_a_run_had_and_the_program_lost_is_another_config(tmp_path):
     here = f"paths.output_dir={tmp_path}/here"
     begin(config(tmp_path, here)).release()
@@ -128,16 +112,6 @@ def test_a_run_that_is_watched_is_the_same_run(tmp_path, more):
     assert settings_digest(watched) == settings_digest(alone)
     hashes = {config_hash(OmegaConf.to_container(each, resolve=True)) for each in (alone, watched)}
     assert len(hashes) == 1
-
-
-def test_where_decoded_pictures_are_kept_does_not_make_another_run(tmp_path):
-    colmap = ("scene=colmap", "scene.root=somewhere", f"paths.output_dir={tmp_path}/here")
-    begin(config(tmp_path, *colmap)).release()
-    run = open_run(
-        config(tmp_path, *colmap, "resume=auto", "scene.verify=true", f"scene.cache_dir={tmp_path}"), 100, None
-    )
-    assert run.path == tmp_path / "here"
-    run.release()
 
 
 def test_resume_of_a_folder_without_a_run_is_refused_and_one_in_use(tmp_path):

@@ -132,23 +132,6 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     assert {row["steps"] for row in table(tmp_path)} == {"50"}
 
 
-@pytest.mark.exhaustive
-@POSIX
-def test_a_stop_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
-    """By the stop file, as on Windows: tests/test_other_systems.py."""
-    longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
-    process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)
-    for folder in ("0_seed=0", "1_seed=1"):
-        wait_for_step(tmp_path / folder, 10, process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    code, output = finished(process)
-    assert code == 130, output
-    assert [row["state"] for row in table(tmp_path)] == ["stopped", "stopped"]
-    assert output.count("stopped at step") == 2
-    assert f"resume with  nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output
-    assert not (tmp_path / "2_seed=2" / "run.json").exists()
-
-
 @pytest.mark.slow
 @POSIX
 def test_sigterm_stops_the_sweep_and_not_only_its_job(capture, tmp_path):
@@ -172,7 +155,7 @@ def test_a_sweep_that_is_refused_leaves_nothing(nerf, tmp_path):
     assert [path.name for path in tmp_path.rglob("*")] == ["own"], "what was there before stays"
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_sweep_is_not_begun_where_one_has_been_but_can_be_extended(nerf, capture, tmp_path):
     assert nerf(*arguments(capture, tmp_path, "seed=0")).code == 0
     refused = nerf(*arguments(capture, tmp_path, "seed=0,1"))

@@ -158,16 +158,6 @@ def test_the_article_trains_on_black_for_all_its_epochs(experiment):
     assert config.trainer.max_epochs == (300 if experiment == "lego_article" else 1000)
 
 
-def test_a_few_steps_of_the_quickstart(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "experiment=quickstart", "scene=npz", f"scene.path={capture}", "trainer.max_steps=2",
-        "data.batch_rays=64", "data.val_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
-        f"paths.output_dir={tmp_path}/run",
-    )  # fmt: skip
-    assert result.code == 0, result.err
-    assert (tmp_path / "run" / "metrics.json").is_file()
-
-
 def test_the_articles_figure_is_drawn_after_each_epoch(train, tmp_path):
     article = ("callbacks=article", "data.batch_rays=512", "data.crop_steps=0", "callbacks.epoch_figures.every_steps=1")
     done(train(*article, "trainer.max_steps=9", "final.evaluate=false", "final.video=false"))

@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.doctor import check, extent, gate
+from nerf_lightning.doctor import extent, gate
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import advice, analyze, examine
 from nerf_lightning.doctor.features import fineness_of
@@ -106,19 +106,6 @@ def test_an_odd_photograph_is_named(name):
         return rgba
 
     judged(with_pictures(changed), check, "look", *fragments)
-
-
-def test_views_are_compared_a_few_at_a_time(monkeypatch):
-    def copy(rgba):
-        rgba[1], rgba[9] = rgba[0], rgba[8]
-        return rgba
-
-    analysis = with_pictures(copy)
-    whole = but_poses(analysis)
-    monkeypatch.setattr(check, "PAIRS_AT_ONCE", 5 * VIEWS)
-    assert check.rows_at_once(VIEWS) == 5
-    assert whole.items() <= but_poses(analysis).items()
-    judged(analysis, "duplicates", "look", "2 pairs")
 
 
 def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits_and_inches_are_named():

@@ -54,6 +54,7 @@ def test_what_a_capture_knows_itself_stays(bricks):
     assert with_distances(replace(bricks, capture_of=(0,) * len(bricks.view_names))).depths is None
 
 
+@pytest.mark.minutes
 @pytest.mark.parametrize(
     ("space", "overrides", "learns"),
     [

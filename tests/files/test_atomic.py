@@ -42,28 +42,6 @@ def test_what_is_being_written_stays(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt", "b.txt"]
 
 
-@pytest.mark.skipif(atomic.fcntl is None, reason="files have no owners there that could be asked for")
-def test_a_file_that_is_made_and_not_yet_locked_is_not_lost(tmp_path, monkeypatch):
-    """Another process that begins in between takes it for a dead one's."""
-    flock = atomic.fcntl.flock
-
-    def sweep_first(handle, operation):
-        monkeypatch.setattr(atomic.fcntl, "flock", flock)
-        atomic.remove_leftovers.cache_clear()
-        atomic.remove_leftovers(tmp_path)
-        flock(handle, operation)
-
-    (tmp_path / "a.txt").touch()
-    atomic.remove_leftovers(tmp_path)
-    monkeypatch.setattr(atomic.fcntl, "flock", sweep_first)
-    with whole_file(tmp_path / "a.txt") as part:
-        assert part.exists()
-        atomic.remove_leftovers.cache_clear()
-        atomic.remove_leftovers(tmp_path)
-        part.write_text("whole")
-    assert [file.read_text() for file in tmp_path.iterdir()] == ["whole"]
-
-
 def test_what_a_person_has_beside_it_stays(tmp_path):
     kept = (".notes.part.txt", "a.12.part.txt", ".profile", ".12.party", ".holiday.2024.part.zip", ".backup.001.part")
     kept += (".thesis.3.part.docx", ".a.12.nerf_lightning.part.txt", ".nerf_lightning.part")
@@ -73,28 +51,6 @@ def test_what_a_person_has_beside_it_stays(tmp_path):
     with whole_file(tmp_path / "a.txt") as part:
         part.write_text("whole")
     assert {file.name for file in tmp_path.iterdir()} == {*kept, LEFT, "a.txt"}
-
-
-@pytest.mark.skipif(atomic.fcntl is None, reason="the system has no locks")
-@pytest.mark.parametrize("error", [None, errno.ENOLCK, errno.EWOULDBLOCK])
-def test_without_locks_the_process_tells_whether_a_writer_lives(tmp_path, monkeypatch, error):
-    """None: a system without them; ENOLCK: a file system; EWOULDBLOCK: there are, and somebody holds it."""
-
-    def no_lock(file, operation):
-        raise OSError(error, "no lock")
-
-    other_machine = LEFT.replace(atomic.MACHINE, "0" * 8)
-    alive = LEFT.replace("999999999", str(os.getppid()))
-    for name in (LEFT, other_machine, alive):
-        (tmp_path / name).write_text("half")
-    if error is None:
-        monkeypatch.setattr(atomic, "fcntl", None)
-    else:
-        monkeypatch.setattr(atomic.fcntl, "flock", no_lock)
-    with whole_file(tmp_path / "a.txt") as part:
-        part.write_text("whole")
-    left = {LEFT} if error == errno.EWOULDBLOCK else set()
-    assert {file.name for file in tmp_path.iterdir()} == {"a.txt", other_machine, alive} | left
 
 
 def test_a_failed_block_leaves_what_was_there_and_its_error_names_the_file(tmp_path):

@@ -48,13 +48,6 @@ def test_nothing_else_makes_or_removes_folders_or_removes_files():
     assert found == ALLOWED
 
 
-def test_none_of_these_functions_goes_by_another_name():
-    for file in files():
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module in ("os", "shutil", "tempfile"):
-                assert not {alias.name for alias in node.names} & (CHANGES | OF_OS), file
-
-
 @links
 def test_below_a_named_folder_nothing_is_reached_through_a_link(tmp_path):
     (tmp_path / "disk" / "a").mkdir(parents=True)

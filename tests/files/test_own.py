@@ -81,31 +81,6 @@ def bricks(folder):
     return BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(folder)).read().pixels.rgba
 
 
-def test_what_is_kept_of_the_bricks_is_the_users_own(tmp_path, umask, caplog):
-    cache = tmp_path / "cache"
-    first = bricks(cache)
-    (path,) = cache.glob("*.npz")
-    assert (mode(cache), mode(path)) == (0o700, 0o600)
-    inode = path.stat().st_ino
-    assert torch.equal(bricks(cache), first)
-    assert path.stat().st_ino == inode
-    path.chmod(0o666)
-    assert torch.equal(bricks(cache), first)
-    assert path.stat().st_ino != inode
-    assert "can be written by others (mode 0666)" in caplog.text
-
-
-def test_bricks_in_a_folder_of_others_are_neither_read_nor_kept(tmp_path, caplog):
-    cache = tmp_path / "cache"
-    first = bricks(cache)
-    (path,) = cache.glob("*.npz")
-    path.write_bytes(b"planted")
-    cache.chmod(0o777)
-    assert torch.equal(bricks(cache), first)
-    assert path.read_bytes() == b"planted"
-    assert f"{cache} can be written by others (mode 0777)" in caplog.text
-
-
 def test_kept_photographs_are_the_users_own(tmp_path, umask, caplog):
     root, cache = WRITERS["llff"](tmp_path / "capture"), tmp_path / "cache"
     first = read("llff", root).pixels.rgba.clone()
@@ -121,15 +96,6 @@ def test_kept_photographs_are_the_users_own(tmp_path, umask, caplog):
         assert torch.equal(read("llff", root).pixels.rgba, first)
         assert mode(path) == 0o600
         assert "can be written by others (mode 0620)" in caplog.text
-
-
-def test_photographs_are_not_kept_in_a_folder_of_others(tmp_path):
-    root, cache = WRITERS["llff"](tmp_path / "capture"), tmp_path / "cache"
-    read("llff", root)
-    cache.chmod(0o777)
-    told = r"cache can be written by others \(mode 0777\).*NERF_LIGHTNING_CACHE or scene"
-    with pytest.raises(InputError, match=told):
-        read("llff", root)
 
 
 def test_numba_reads_no_programs_from_a_folder_of_others(tmp_path, monkeypatch, caplog):

@@ -14,6 +14,7 @@ from support.running import FAST, FAST_PATH, NO_LAYOUT, output_of, start_cold
 from support.scenes import ball_scene
 
 from nerf_lightning.cli import main as cli
+from nerf_lightning.data.readers.npz import NpzReader
 
 
 @dataclass
@@ -38,6 +39,7 @@ def save_ball(folder):
     poses[:, :3] = scene.cameras.c2w
     images = (pictures[..., :3] * pictures[..., 3:]).numpy()
     np.savez(folder / "ball.npz", images=images, poses=poses.numpy(), focal=1.6 * 16)
+    NpzReader(str(folder / "ball.npz")).read()  # so that no command says that it has cached the pictures
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import sys
 import types
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -47,35 +46,3 @@ def test_all_of_ours_are_checked_so():
     decorators = {Path(each.__code__.co_filename).name for each in ours}
     assert Path(type_checks.__file__).name in decorators
     assert "_decorator.py" not in decorators
-
-
-def test_a_dataclass_is_checked_when_it_is_made():
-    @checked(typechecker=beartype)
-    @dataclass(frozen=True)
-    class Pair:
-        one: Float[Tensor, " n"]
-        other: Float[Tensor, " n"]
-        name: str = ""
-
-    Pair(torch.ones(3), torch.ones(3), "a")
-    with pytest.raises(TypeCheckError, match="other"):
-        Pair(torch.ones(3), torch.ones(2))
-    with pytest.raises(TypeCheckError, match="name"):
-        Pair(torch.ones(3), torch.ones(3), 3)
-
-
-def test_what_passed_once_passes_again_and_nothing_else_does():
-    calls = []
-
-    @decorated
-    def parts(values: Float[Tensor, " n"], kind: str, more: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], str]:
-        calls.append(kind)
-        return (values, kind) if kind == "right" else (more[1:], kind)
-
-    for _ in range(2):
-        assert len(parts(torch.ones(3), "right", torch.ones(3))) == 2
-        with pytest.raises(TypeCheckError, match="return"):
-            parts(torch.ones(3), "wrong", torch.ones(3))
-        with pytest.raises(TypeCheckError, match="more"):
-            parts(torch.ones(3), "right", torch.ones(2))
-    assert calls == 2 * ["right", "wrong"]

@@ -17,7 +17,7 @@ from support.running import FAST, refused, start_code
 import nerf_lightning as nl
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.training import loggers
-from nerf_lightning.training.loggers import MLflow, WeightsAndBiases, opened_loggers, show_picture
+from nerf_lightning.training.loggers import WeightsAndBiases, opened_loggers, show_picture
 
 PICTURE = torch.zeros(4, 5, 3, dtype=torch.uint8)
 
@@ -113,32 +113,6 @@ def test_pictures_go_to_those_who_take_them_and_a_run_of_weights_and_biases_ends
     with pytest.raises(KeyError), opened_loggers(chosen, tmp_path, "now"):
         raise KeyError
     assert taker.codes == [0, 1]
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_weights_and_biases_keeps_a_run_offline(trained, monkeypatch):
-    pytest.importorskip("wandb", reason="W&B is an extra: pip install '.[wandb]'")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    run = trained("logger=wandb", "callbacks.validation_pictures.every_steps=2")
-    (kept,) = (run.folder / "wandb").glob("offline-run-*")
-    assert len(list((kept / "files" / "media" / "images").rglob("*.png"))) == 2  # of steps 2 and 4
-    first, second = (WeightsAndBiases(offline=True).open(run.folder, started) for started in ("then", "now"))
-    assert first._id != second._id
-    first.experiment.finish()
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_mlflow_keeps_curves_settings_and_pictures(trained):
-    mlflow = pytest.importorskip("mlflow", reason="MLflow is an extra: pip install '.[mlflow]'")
-    run = trained("logger=mlflow", "callbacks.validation_pictures.every_steps=2")
-    client = mlflow.MlflowClient(f"sqlite:///{run.folder / 'mlflow.db'}")
-    (found,) = client.search_runs([client.get_experiment_by_name("nerf_lightning").experiment_id])
-    assert found.data.metrics["test/psnr"] == pytest.approx(run.psnr)
-    assert found.data.params["choice.model"] == "nerf_tiny"
-    assert found.info.status == "FINISHED"
-    assert len(list((run.folder / "mlflow").rglob("step_*.png"))) == 2
-    refused(MLflow(tracking_uri="nowhere://x").open, run.folder, "now", parts=("nowhere://x", "logger.mlflow.tracking"))
 
 
 # Fails from the given write, or the given flush, on, as a full disk does.

@@ -15,7 +15,6 @@ from support.running import refused
 from nerf_lightning.files.made_folders import MARK
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
-from nerf_lightning.video import frames as film_frames
 from nerf_lightning.video.frames import FilmFrames
 from nerf_lightning.video.panels import film_pictures, panel
 from nerf_lightning.visualization.pictures import letter_size, save_png
@@ -96,22 +95,6 @@ def test_a_full_disk_is_said_in_one_paragraph_and_the_frames_are_kept(tmp_path):
     assert "\n" not in str(said.value)
     each.close()
     assert opened(frames(tmp_path))[0] == [2, 3]
-
-
-def full_for_ffmpeg(*arguments, **options):
-    raise InputError("ffmpeg failed with code 228: No space left on device.")
-
-
-@pytest.mark.parametrize("failure", [full, full_for_ffmpeg])
-def test_a_disk_that_is_full_when_the_video_is_made_keeps_the_frames(tmp_path, monkeypatch, failure):
-    stop_after(tmp_path, 0, 1, 2, 3)
-    each = frames(tmp_path)
-    opened(each)
-    monkeypatch.setattr(film_frames, "write_video", failure)
-    with pytest.raises(InputError, match=r"No space left.*4 of 4 frames are kept"):
-        each.finish(fps=4)
-    each.close()
-    assert opened(frames(tmp_path))[0] == []
 
 
 def test_a_frame_that_cannot_be_read_is_named(tmp_path):

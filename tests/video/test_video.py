@@ -276,18 +276,6 @@ def test_without_openexr_it_is_refused_before_the_work(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_full_disk_is_said_and_nothing_half_written_stays(tmp_path, monkeypatch):
-    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (the extra exr)")
-
-    def full(file, path):
-        raise RuntimeError("No space left on device")
-
-    monkeypatch.setattr(openexr.File, "write", full)
-    with pytest.raises(InputError, match=r"No space left on device.*0 of 2 frames are kept"):
-        film([ball_of()], PATH, 1 << 15, tmp_path, FilmSettings(form="exr"))
-    assert not list(tmp_path.glob("exr/*.exr"))
-
-
 @pytest.mark.parametrize("changes", [{"mosaic": True}, {"outputs": ["rgb", "normals"]}])
 def test_other_outputs_are_refused(changes):
     assert film_settings(PLAIN | {"format": "exr"}).form == "exr"

@@ -1,4 +1,3 @@
-import gc
 import os
 import warnings
 
@@ -160,13 +159,3 @@ def test_the_epoch_shows_three_panels():
     middle = picture[:, width // 3 : 2 * width // 3]
     assert len(torch.unique(middle.reshape(-1, 3), dim=0)) > 20
     assert ink(picture[:, 2 * width // 3 :]) > 0.002
-
-
-def test_nothing_global_stays_behind():
-    from matplotlib import pyplot
-    from matplotlib.figure import Figure
-
-    loss_curve([0, 1], [1.0, 0.5])
-    gc.collect()
-    assert pyplot.get_fignums() == []
-    assert not [thing for thing in gc.get_objects() if type(thing) is Figure]

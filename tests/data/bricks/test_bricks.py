@@ -1,14 +1,12 @@
 """The built-in scene: its solids against closed forms, its pictures against its geometry, its cache."""
 
 import hashlib
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.data.bricks import reader as reader_module
 from nerf_lightning.data.bricks.parts import fire_engine
 from nerf_lightning.data.bricks.reader import DISTANCE, PACKAGED, BricksReader, bricks_cameras, packaged_pictures
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE
@@ -121,39 +119,6 @@ def test_the_fire_engine_keeps_its_parts_and_its_file(tmp_path: Path) -> None:
     assert digest[:16] == "b09e1dec1e67790a"
     BricksReader(resolution=16, num_train=2, num_val=0, num_test=0, cache_dir=str(tmp_path)).read()
     assert [file.name for file in tmp_path.glob("*.npz")] == ["401381e4b296a378.npz"]
-
-
-def test_one_of_many_readers_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[int] = []
-    original = reader_module.render
-    monkeypatch.setattr(reader_module, "render", lambda *given: calls.append(1) or original(*given))
-    scenes: list[Scene] = []
-    small = BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(tmp_path))
-    threads = [threading.Thread(target=lambda: scenes.append(small.read())) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(calls) == 1
-    assert len(scenes) == 4
-    assert all(torch.equal(scene.pixels.rgba, scenes[0].pixels.rgba) for scene in scenes)
-    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".lock"}
-
-
-@pytest.mark.parametrize("damage", [b"", None], ids=["empty", "cut"])
-def test_damaged_cache_is_rendered_anew(damage: bytes | None, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    small = BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(tmp_path))
-    first = small.read()
-    (path,) = tmp_path.glob("*.npz")
-    sound = path.read_bytes()
-    path.write_bytes(sound[: len(sound) // 2] if damage is None else damage)
-    again = small.read()
-    assert torch.equal(first.pixels.rgba, again.pixels.rgba)
-    assert "is damaged" in caplog.text
-    assert path.read_bytes()[:2] == b"PK"
-    caplog.clear()
-    small.read()
-    assert not caplog.text
 
 
 def test_unwritable_cache_costs_a_warning_and_its_folder_follows_the_environment(

@@ -6,7 +6,6 @@ import re
 import struct
 import sys
 import zipfile
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from support.malformed import WRITERS, edit_json
 from support.posed_captures import Known, read, write_colmap
 from support.running import refused
 
-from nerf_lightning.data.captures import reader as capture_reader
 from nerf_lightning.data.captures.checks import check_step
 from nerf_lightning.data.captures.find_pictures import pictures_below
 from nerf_lightning.data.pixels.picture_files import MOST_SCANS, image_size, jpeg_scans, read_rgba
@@ -26,7 +24,6 @@ from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.files.json_files import read_json
-from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 
 HEADERS = {
@@ -75,25 +72,6 @@ def test_folders_within_folders_without_end(tmp_path):
     finally:
         sys.setrecursionlimit(before)
     assert found == [deepest / "x.PNG"]
-
-
-def test_folders_are_walked_as_python_does(tmp_path):
-    for name in ("b", "a", "a/c"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "file").touch()
-    (tmp_path / "link").symlink_to("a")
-    (tmp_path / "loop").symlink_to("loop")
-    seen = []
-    for base, folders, names in walk(tmp_path):
-        folders.sort()
-        seen.append((base.relative_to(tmp_path).as_posix(), folders, sorted(names)))
-    assert seen == [
-        (".", ["a", "b", "link"], ["loop"]),
-        ("a", ["c"], ["file"]),
-        ("a/c", [], ["file"]),
-        ("b", [], ["file"]),
-    ]
-    assert list(walk(tmp_path / "absent")) == []
 
 
 def test_a_folder_whose_name_is_none(tmp_path):
@@ -241,16 +219,3 @@ def test_ten_million_cameras_in_other_files(tmp_path):
             BlenderReader(str(tmp_path / "blender")).read()
         with pytest.raises(InputError, match=r"a\.npz has 10 views"):
             NpzReader(str(write_npz(tmp_path / "a.npz"))).read()
-
-
-def test_kept_pixels_of_other_sizes_than_the_photographs(tmp_path, monkeypatch):
-    """As many numbers, in rows of another length: a cache that somebody else wrote."""
-    real = capture_reader.read_photographs
-
-    def turned(*arguments, **options):
-        pixels = real(*arguments, **options)
-        return replace(pixels, width=pixels.height, height=pixels.width)
-
-    root = WRITERS["transforms"](tmp_path / "capture")
-    monkeypatch.setattr(capture_reader, "read_photographs", turned)
-    malformed.refused("transforms", root, "cached pixels of .* have other sizes than its photographs")

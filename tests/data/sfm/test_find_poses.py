@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from support.running import refused
 
-from nerf_lightning.data.sfm import find_poses, reconstruction
+from nerf_lightning.data.sfm import find_poses
 from nerf_lightning.data.sfm.find_poses import UNFINISHED, from_photographs, require_new_capture
 from nerf_lightning.data.sfm.reconstruction import SparseModel
-from nerf_lightning.data.sfm.settings import Attempt, SfmSettings
+from nerf_lightning.data.sfm.settings import SfmSettings
 
 links = pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
 
@@ -112,25 +112,3 @@ def test_a_full_disk_is_said_of_the_folder_that_is_written(capture, tmp_path, mo
     with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/out'"):
         found(tmp_path / "out", capture / "images")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("is_full", [True, False])
-def test_a_full_disk_is_found_where_colmap_does_not_tell_of_it(tmp_path, monkeypatch, is_full):
-    """With pycolmap 4 it is: No registered database factory succeeded."""
-
-    class Colmap:
-        class logging:
-            minloglevel, FATAL = 0, 3
-
-        @staticmethod
-        def set_random_seed(seed):
-            raise RuntimeError("No registered database factory succeeded.")
-
-    def write(path, content):
-        if is_full:
-            raise full()
-
-    monkeypatch.setattr(reconstruction, "require_pycolmap", lambda: Colmap)
-    monkeypatch.setattr(type(tmp_path), "write_bytes", write)
-    with pytest.raises(OSError if is_full else RuntimeError, match="No space" if is_full else "No registered"):
-        reconstruction.reconstruct([], tmp_path, tmp_path, SfmSettings(), Attempt(600))

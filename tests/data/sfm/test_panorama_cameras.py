@@ -100,6 +100,7 @@ def test_colmap_and_we_see_the_same_directions_in_them():
     np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_panoramas_of_a_room_are_placed_and_read_with_the_distances_of_its_walls(tmp_path):
     pytest.importorskip("pycolmap", minversion="4.1")

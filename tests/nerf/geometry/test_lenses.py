@@ -6,7 +6,7 @@ import torch
 
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels
 from nerf_lightning.nerf.geometry.lens_checks import lens_faults
-from nerf_lightning.nerf.geometry.lenses import off_axis, project_plane, stretches, unproject
+from nerf_lightning.nerf.geometry.lenses import project_plane, stretches, unproject
 from nerf_lightning.nerf.geometry.poses import look_at
 
 FOX = [0.0578421, -0.0805099, 0.0, 0.0, -0.000980296, 0.00015575]
@@ -84,26 +84,6 @@ def test_the_formulas_of_opencv_in_numbers():
     bent = t * (1 + 0.1 * t**2 - 0.2 * t**4 + 0.3 * t**6 - 0.4 * t**8)
     direction = torch.tensor([0.6, 0.8, 1.0], dtype=torch.float64)
     assert project_plane(direction, lens, "fisheye").tolist() == pytest.approx([0.6 * bent, 0.8 * bent], abs=1e-12)
-
-
-def bisected(distorted, k, highest):
-    """The radius that r (1 + k1 r^2 + ...) brings to `distorted`, in plain numbers."""
-    low, high = 0.0, highest
-    for _ in range(200):
-        r = 0.5 * (low + high)
-        low, high = (r, high) if r * (1 + sum(c * r ** (2 * i + 2) for i, c in enumerate(k))) < distorted else (low, r)
-    return low
-
-
-@pytest.mark.parametrize(("model", "lens"), [("radial_tangential", STRONG), ("fisheye", GOPRO)])
-def test_against_bisection_on_the_radius(model, lens):
-    for u, v in places(30).tolist():
-        plane, coefficients = (torch.tensor(values, dtype=torch.float64) for values in ([u, v], lens))
-        direction = unproject(plane, coefficients, model)
-        found = bisected(math.hypot(u, v), lens[:4], 3.0)
-        radius = math.tan(off_axis(direction)[0]) if model == "radial_tangential" else float(off_axis(direction)[0])
-        assert radius == pytest.approx(found, abs=1e-9)
-        assert math.atan2(direction[1], direction[0]) == pytest.approx(math.atan2(v, u), abs=1e-9)
 
 
 def test_each_view_has_its_own_lens():

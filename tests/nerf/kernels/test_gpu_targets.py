@@ -43,8 +43,9 @@ SMALL = {
 BFLOAT16 = [name for name in DEVICES if name != "sm_75"]  # where float32 is used instead
 # The one that the kernels of the default model did not fit into is always tried. Those that differ from another in age
 # or in shared memory alone, and the largest of data centers, are left to make test-all.
-MARKS = {"sm_89": [], **dict.fromkeys(("sm_75", "sm_120", "gfx942"), pytest.mark.minutes)}
-FOR_ALL = [pytest.param(name, marks=MARKS.get(name, pytest.mark.exhaustive)) for name in DEVICES]
+MINUTES, EXHAUSTIVE = pytest.mark.minutes, pytest.mark.exhaustive
+MARKS = {"sm_89": [], **dict.fromkeys(("sm_75", "sm_120", "gfx942"), MINUTES)}
+FOR_ALL = [pytest.param(name, marks=MARKS.get(name, EXHAUSTIVE)) for name in DEVICES]
 USED = torch.ones(1, dtype=torch.int64)
 """Where padding begins, as kernels get it of rays with different numbers of samples."""
 MOST_SPILLED = 152
@@ -126,11 +127,13 @@ def test_small_kernels_compile_and_keep_all_in_registers(name, monkeypatch):
         assert made.spilled() <= (MOST_SPILLED if module == "field.cuda" else 0), module  # as other MLPs
 
 
-WIDEST = {"sm_89": pytest.mark.minutes, "sm_100": pytest.mark.minutes}  # one that has the room, and one that lacks it
-
-
+# The one that takes some and refuses others is tried more often.
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=WIDEST.get(name, pytest.mark.exhaustive)) for name in BFLOAT16]
+    "name",
+    [
+        pytest.param(each, marks=pytest.mark.minutes if each == "sm_100" else pytest.mark.exhaustive)
+        for each in BFLOAT16
+    ],
 )
 def test_the_widest_layers_fit_or_are_refused(name, caplog):
     with compiled_for(name, KERNELS), caplog.at_level(logging.WARNING):

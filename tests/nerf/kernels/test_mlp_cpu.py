@@ -1,11 +1,7 @@
 """The perceptron that stays in the cache, in float32 and bfloat16, against the same roundings in plain torch."""
 
-import os
-import subprocess
-import sys
 from itertools import pairwise
 
-import llvmlite.binding as llvm
 import numpy as np
 import pytest
 import torch
@@ -122,26 +118,6 @@ def test_other_widths_take_the_other_way(monkeypatch, kernels, dtype):
     monkeypatch.setattr(kernels, "_forward", lambda *arguments: pytest.fail("not this way"))
     matmul_precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
     assert far_apart(mlp(points, weights, matmul_precision), mlp_torch(points, weights).double()) < 2e-2
-
-
-@pytest.mark.minutes
-@pytest.mark.skipif(
-    llvm.get_host_cpu_features().get("avx512f") is None, reason="this CPU's registers are narrow anyway"
-)
-def test_narrow_registers_give_the_same_products():
-    """As numba compiles for a CPU with AVX2 alone."""
-    program = (
-        "import torch; from nerf_lightning.nerf.kernels.mlp import cpu\n"
-        "assert (cpu.WIDE, cpu.dtypes()) == (False, [torch.float32])\n"
-        "points, weights = torch.randn(300, 32), [torch.randn(80, 32), torch.randn(3, 80)]\n"
-        "out, kept = cpu.forward(points, weights, keep=True)\n"
-        "torch.testing.assert_close(out, (points @ weights[0].t()).relu() @ weights[1].t(), rtol=1e-4, atol=1e-3)\n"
-        "of_points, of_weights = cpu.backward(out, weights, kept, True)\n"
-        "hidden = (points @ weights[0].t()).relu()\n"
-        "torch.testing.assert_close(of_weights[1], out.t() @ hidden, rtol=1e-3, atol=1)\n"
-    )
-    other = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+f16c"}
-    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | other)
 
 
 def test_a_compiler_that_does_not_know_the_instructions_is_not_asked(monkeypatch, kernels):

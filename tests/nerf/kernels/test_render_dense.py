@@ -13,7 +13,6 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.kernels.render import workspace
 from nerf_lightning.nerf.matmul_precision import set_precision
 from nerf_lightning.nerf.models import dense_level
 from nerf_lightning.nerf.models.dense_level import DenseLevel
@@ -228,23 +227,7 @@ def test_rays_of_any_shape_are_rendered():
     assert level(rays.map(lambda each: each[0]), None, [], None).rgb.shape == (3,)
 
 
-def test_a_second_way_back_is_refused():
-    seen = a_level()(some_rays(5), None, [], None).rgb.sum()
-    seen.backward(retain_graph=True)
-    with pytest.raises(RuntimeError, match="sent back already"):
-        seen.backward()
-
-
 def test_learnt_rays_that_are_no_numbers_read_nothing_beyond_the_table():
     level, rays = a_level(contraction=True), some_rays(20)
     broken = replace(rays, directions=torch.full_like(rays.directions, torch.nan).requires_grad_())
     level(broken, None, [], None).weights.nan_to_num().sum().backward()
-
-
-def test_few_workspaces_wait(monkeypatch):
-    monkeypatch.setattr(workspace, "_spare", [])
-    monkeypatch.setattr(workspace, "MOST_BYTES", 3 * workspace.Workspace.of(128, 8, 0).bytes)
-    workspace.give_back([workspace.Workspace.of(128, 8, 0) for _ in range(5)])
-    assert len(workspace._spare) == 3
-    workspace.forget_workspaces()
-    assert not workspace._spare

@@ -7,7 +7,6 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from support.static_models import fast_model
 
-from nerf_lightning.nerf.kernels.ragged.op import first_of_each_ray, num_visible
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
@@ -185,31 +184,6 @@ def test_samples_end_where_the_ray_is_opaque():
     optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
     longest = 80.0 * level.sampler.step_size
     assert 1.0 < float(optical.max()) <= -torch.tensor(1e-3).log() + longest + 1e-3
-
-
-@pytest.mark.parametrize("opaque_below", [0.5, 1e-6])
-def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypatch):
-    level, rays, random, asked = a_level(opaque_below=opaque_below), some_rays(300), batch_random(1, 300), []
-    plain = level.field.density
-
-    def density_of(points):  # noise is drawn for each sample by its number in its ray
-        return plain(points)[0] * (0.5 + points.random.uniform("noise")), None
-
-    monkeypatch.setattr(level.field, "density", lambda points: asked.append(points) or density_of(points))
-    found, _ = visible_samples(level.sampler, level.field, rays, random)
-    samples = level.sampler(rays, random)
-    with torch.no_grad():
-        density, _ = density_of(ragged_points(rays, samples, random))
-    kept, _ = first_of_each_ray(samples, num_visible(density, samples, opaque_below))
-    for ours, theirs in zip(found.tensors(), kept.tensors(), strict=True):
-        assert torch.equal(ours, theirs)
-    number = sum(points.positions.shape[0] for points in asked)
-    assert len(asked) > 3
-    assert kept.starts.numel() <= number
-    if opaque_below == 0.5:
-        assert number < 0.8 * samples.starts.numel(), "what lies behind opaque samples is not asked about"
-    else:
-        assert number == samples.starts.numel(), "no sample is asked about twice"
 
 
 def test_tiles_change_nothing_but_rounding():

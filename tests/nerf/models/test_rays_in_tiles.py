@@ -16,12 +16,9 @@ from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models import render_image
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
+from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.part import fit_parts
-from nerf_lightning.nerf.rendering.background import photograph
 from nerf_lightning.nerf.types.renderings import Rendering
-from nerf_lightning.nerf.types.scene import PixelStore
-from nerf_lightning.visualization.pictures import panels
 
 TILE = 300
 WIDTH, HEIGHT, LARGE_TILE = 500, 250, 4096
@@ -82,23 +79,6 @@ def test_no_more_rays_than_a_tile_has_are_made_at_once(clip, per_side, monkeypat
     assert 0 < max(made) <= LARGE_TILE
     finished = 4 * (3 + 1 + 1 + 3) * WIDTH * HEIGHT
     assert finished < held < finished + 1000 * LARGE_TILE
-
-
-def test_what_is_measured_and_shown_of_a_picture_takes_no_more_than_copies_of_it(monkeypatch):
-    monkeypatch.setattr(row_chunks, "CHUNK_PIXELS", LARGE_TILE)
-    rgb = torch.rand(HEIGHT, WIDTH, 3)
-    picture, truth = Picture(rgb, 2 + rgb[..., 0], rgb[..., 1]), rgb.flip(0)
-    rgba = torch.zeros(WIDTH * HEIGHT, 4, dtype=torch.uint8)
-    sides = torch.tensor([WIDTH]), torch.tensor([HEIGHT])
-    scene = replace(SCENE, pixels=PixelStore(rgba, torch.zeros(1, dtype=torch.int64), *sides, has_transparency=True))
-    for copies, work in {
-        12: lambda: photograph(scene, 0, "white"),
-        24: lambda: image_metrics(rgb, truth),
-        16: lambda: picture_surface(large_view(), 1, picture),
-        13: lambda: normals_from_depth(rgb),
-        6: lambda: [picture.shape for _, picture in panels(truth, rgb, picture.depth, picture.opacity)],
-    }.items():
-        assert peak_bytes(work, torch.device("cpu")) < copies * WIDTH * HEIGHT + 1000 * LARGE_TILE
 
 
 def test_metrics_are_those_of_the_whole_picture(monkeypatch):

@@ -9,8 +9,6 @@ from support.configs import composed
 from support.scenes import ball_scene, tiny_model
 from support.static_models import fast_model, static_system
 from support.steps import make_step, rays_of
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
@@ -25,7 +23,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.attempts import draw_weights
 from nerf_lightning.training.callbacks import pictures, watcher
 from nerf_lightning.training.callbacks.monitor import level_scalars
-from nerf_lightning.training.callbacks.ray_histograms import PARTS, look_along, write_shares
+from nerf_lightning.training.callbacks.ray_histograms import look_along
 from nerf_lightning.training.step import TrainStep
 
 
@@ -91,30 +89,6 @@ def test_looking_changes_nothing_that_training_reads(name):
     for parameter, gradient in zip(train_step.objective.model.parameters(), gradients, strict=True):
         assert torch.equal(parameter.grad, gradient)
     assert torch.equal(torch.get_rng_state(), generator)
-
-
-@pytest.mark.parametrize("name", ["nerf", "fast_dense"])
-def test_tiles_do_not_show(name):
-    train_step, batch = a_system(name)
-    whole = look_along(train_step, batch.pixels, 7, contracted_spacing=False)
-    train_step.tiles.points = 300
-    parts = look_along(train_step, batch.pixels, 7, contracted_spacing=False)
-    assert list(whole) == list(train_step.objective.model.level_names)
-    for level in whole:
-        torch.testing.assert_close(parts[level], whole[level])
-
-
-def test_a_histogram_holds_the_shares_that_it_was_given(tmp_path):
-    shares = torch.zeros(PARTS)
-    shares[0], shares[10] = 0.25, 0.5
-    with SummaryWriter(str(tmp_path)) as writer:
-        write_shares(writer, "along_rays/weight_fine", shares, 500)
-    (event,) = EventAccumulator(str(tmp_path)).Reload().Histograms("along_rays/weight_fine")
-    value = event.histogram_value
-    mass = {round(limit, 6): count for limit, count in zip(value.bucket_limit, value.bucket, strict=True) if count}
-    assert event.step == 500
-    assert mass == {0.02: 0.25, 0.22: 0.5}
-    assert value.sum / value.num == pytest.approx((0.25 * 0.01 + 0.5 * 0.21) / 0.75)
 
 
 def a_run(scene, train_step, folder):

@@ -10,11 +10,11 @@ from test_chosen_paths import MIDDLE, UP, frame, keyframe_file
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project
-from nerf_lightning.nerf.geometry.poses import is_rigid, quaternion_from_rotation, rotation_from_quaternion
+from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, read_keyframes, write_keyframes
-from nerf_lightning.video.paths.spline import hermite, rotations_along
+from nerf_lightning.video.paths.spline import rotations_along
 
 
 def test_what_is_written_is_read_back_and_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
@@ -135,23 +135,6 @@ def test_focal_lengths_go_from_keyframe_to_keyframe(tmp_path):
     focal = path.cameras(frame()).focal
     assert focal[:, 0].tolist() == pytest.approx([25.0, 100.0, 70.0], rel=0.02)  # of a picture half as wide
     assert KeyframePath(file, num_frames=3, fov=90.0).cameras(frame()).focal[1].tolist() == pytest.approx([50.0, 50.0])
-
-
-def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots():
-    knots = torch.tensor([0.0, 1.0, 1.7, 3.0, 4.5], dtype=torch.float64)
-    values = (knots**2 - 3 * knots)[:, None]
-    torch.testing.assert_close(hermite(knots, values, knots), values)
-    at = torch.linspace(1.0, 3.0, 9, dtype=torch.float64)
-    torch.testing.assert_close(hermite(knots, values, at), (at**2 - 3 * at)[:, None])
-
-
-def test_a_quaternion_is_its_rotations():
-    generator = torch.Generator().manual_seed(0)
-    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
-    half_turns = torch.eye(4, dtype=torch.float64)
-    given = torch.cat([quaternions, half_turns])
-    found = quaternion_from_rotation(rotation_from_quaternion(given))
-    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
 
 
 def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():

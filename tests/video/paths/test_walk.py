@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_chosen_paths import UP, frame, in_another_frame
+from test_chosen_paths import UP, frame
 
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.video.paths.auto import AutoPath
@@ -64,14 +64,6 @@ def test_a_walk_is_steadier_than_the_photographs_and_passes_them_from_neighbor_t
     assert walking_order(around.poses, 1.0).tolist() == list(range(20))
     eyes = around.poses[mixed][walking_order(around.poses[mixed], 1.0)][:, 0, 3]
     assert float(eyes.diff().abs().sum()) < 40  # in the order of the files it is about 130
-
-
-def test_a_walk_does_not_depend_on_the_working_frame():
-    around = corner()
-    here, there = Walk(9).cameras(around).c2w, Walk(9).cameras(in_another_frame(around, [0.9, 0.1, -0.3, 0.2])).c2w
-    apart = [each[1:, :, 3] - each[:-1, :, 3] for each in (here, there)]
-    ratio = apart[1].norm(dim=-1) / apart[0].norm(dim=-1)
-    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
 
 
 def test_cameras_that_look_straight_down_keep_their_own_up():

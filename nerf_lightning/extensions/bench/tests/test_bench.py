@@ -27,6 +27,7 @@ def bench(nerf, tmp_path):
     return call
 
 
+@pytest.mark.minutes
 def test_bench_measures_a_packed_model(bench, monkeypatch):
     tiles, train = [], Bench.train
     monkeypatch.setattr(
@@ -48,6 +49,7 @@ def test_bench_measures_a_packed_model(bench, monkeypatch):
     assert measured["training_flops_per_ray"] > 0
 
 
+@pytest.mark.minutes
 def test_bench_replays_what_training_would_replay(bench, monkeypatch):
     """`support.tape` stands for CUDA graphs, with the torch twins of the kernels."""
     monkeypatch.setattr(OccupancySampler, "capacity_for", lambda sampler, rays: 8192)

@@ -182,6 +182,7 @@ def test_normalised_device_coordinates_become_places_in_the_world(tmp_path):
     assert np.median(np.abs(gsply.plyread(path).means[:, 2] + 3.0)) < 0.15
 
 
+@pytest.mark.minutes
 def test_panoramas_are_taken_as_faces_of_cubes(tmp_path):
     """A ball around the cameras, as a room is."""
     room, around = solid(lambda positions: 1.5 - positions.norm(dim=-1)), ball_scene(num_views=4, size=24)

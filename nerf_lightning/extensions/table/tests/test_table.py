@@ -43,15 +43,6 @@ def test_what_a_run_did_not_say_is_told_from_its_config(table, tmp_path):
     assert [(row["optimizer.lr"], row["refinement"]) for row in rows] == [("0.001", "se3"), ("0.03", "none")]
 
 
-def test_settings_without_a_column_are_counted_below(table, tmp_path):
-    for number in range(2):
-        overrides = tuple(f"optimizer.a{key:02d}={number}" for key in range(34))
-        leave_measured_run(tmp_path / "runs" / str(number), 20.0, overrides=overrides)
-    result, rows = table("published=false")
-    assert len([column for column in rows[0] if column.startswith("optimizer.")]) == 32
-    assert "2 more settings differ and have no column: optimizer.a32, optimizer.a33." in result.out
-
-
 BESIDE_THE_RESULT = (
     *("model={}", "scene={}", "scene@scene={}", "resume={}", "path={}", "path.num_frames={}", "logger={}"),
     *("logger.tensorboard.name={}", "~logger.tensorboard={}", "paths.output_dir={}", "sweep.resume={}"),
@@ -334,15 +325,3 @@ DAMAGED_ORIGINS = [
     *({"seed": seed} for seed in ("--5", "-", "\u0663", "\u00b2", "9" * 5000, 1.5, True)),
     {"seed": None, "model": "\ud800", "scene": "\ud800", "device": "\ud800"},
 ]
-
-
-@pytest.mark.parametrize("origin", DAMAGED_ORIGINS, ids=lambda origin: ascii(origin)[:40])
-def test_damaged_parts_of_metrics_are_left_out(table, tmp_path, origin):
-    run = leave_measured_run(tmp_path / "runs" / "a", started=7, finished_at_step=["x"], training_seconds={})
-    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": origin}
-    (run / "metrics.json").write_text(json.dumps(content))
-    leave_measured_run(tmp_path / "runs" / "b", 19.0, seed=1)
-    result, rows = table("force=true")
-    assert result.code == 0, result.err
-    assert "20.0" in [row["PSNR"] for row in rows]
-    assert all(row["seeds"] in ("", "1") for row in ours(rows))
