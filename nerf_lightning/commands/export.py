@@ -29,6 +29,7 @@ from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.file_steps import record_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
@@ -68,6 +69,8 @@ def export(config: DictConfig) -> list[Path]:
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with filled_folder(config.paths.output_dir, default) as folder:
         written = write_files(what, opened, photographs, path, folder, crop, config.min_opacity)
+        if folder == default:  # which the report shows
+            record_steps(folder, written, opened.checkpoint.step)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are the refined ones (refinement=...), not those that were read")
     say_written(*written)

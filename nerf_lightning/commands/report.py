@@ -6,6 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
@@ -30,7 +31,9 @@ def run(config: DictConfig) -> str:
     target = output_folder(config.paths.output_dir, run) / "report.html"
     most_video_bytes = int(config.max_megabytes * 1e6)
     doctor = partial(_examine_capture, config) if config.doctor else None
-    report = read_run(run, run / FILES[config.measured], most_video_bytes, doctor, target.parent)
+    report = read_run(
+        run, run / FILES[config.measured], most_video_bytes, doctor, target.parent, to_type("resume", str(run))
+    )
     write_report(report, target)
     lines = [f"left out     {line}" for line in report.missing]
     say(*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)")

@@ -17,6 +17,7 @@ Curve = tuple[Sequence[int], Sequence[float]]  # Steps and values
 MOST_CURVES = 12
 """In one chart; more are not told apart, and a stranger's file may have thousands."""
 DIGITS = 5
+MOST_EQUAL = 3  # Names of one curve
 LARGEST_STEP = 10**12
 """An untrusted file may number steps beyond what a script can count."""
 
@@ -65,10 +66,14 @@ def curve_drawings(curves: Mapping[str, Curve]) -> list[Drawing]:
         matched = {tag: match[1] for tag in sorted(curves) if (match := chart.tags.fullmatch(tag))}
         labels = _labels(matched)
         finite = {tag: _finite(curves[tag], chart) for tag in matched}
+        # Equal curves, such as a level's loss of one term, would hide each other.
+        equal: dict[tuple[Any, ...], list[str]] = {}
+        for tag, (steps, values) in finite.items():
+            if len(steps) > 1:
+                equal.setdefault((tuple(steps), tuple(values)), []).append(labels[tag])
         drawn = [
-            {"label": labels[tag], "steps": steps, "values": values}
-            for tag, (steps, values) in finite.items()
-            if len(steps) > 1
+            {"label": " = ".join(names[:MOST_EQUAL]), "steps": list(steps), "values": list(values)}
+            for (steps, values), names in equal.items()
         ]
         if drawn:
             more = len(drawn) - MOST_CURVES

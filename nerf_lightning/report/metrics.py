@@ -27,6 +27,33 @@ LABELS = {
     "depth_error": "mean depth error (scene units)",
     "normal_error": "mean error of surface normals",
 }
+ROWS = {
+    ("protocol", "split"): "views",
+    ("protocol", "split_hash"): "fingerprint of these views",
+    ("protocol", "pixels"): "colors of the render",
+    ("protocol", "colors"): "colors fitted before scoring",
+    ("protocol", "masks"): "masked pixels",
+    ("protocol", "downscale"): "photographs shrunk by",
+    ("protocol", "filter"): "filter when shrinking",
+    ("protocol", "hold_every"): "held out: one view in",
+    ("origin", "config"): "fingerprint of the config",
+    ("origin", "checkpoint"): "fingerprint of the weights",
+    ("origin", "commit"): "commit of the code",
+    ("origin", "megabytes"): "weights (MB)",
+    ("environment", "memory_gigabytes"): "memory (GB)",
+}
+"""Labels of rows of the tables, by table and key."""
+WORDS = {
+    ("pixels", "float"): "not rounded",
+    ("pixels", "8-bit"): "rounded to 8 bits",
+    ("cameras", "raw"): "as given",
+    ("cameras", "refined"): "refined in training",
+    ("colors", "raw"): "no",
+    ("masks", "none"): "there are none",
+    ("precision", "32-true"): "float32",
+    ("precision", "bf16-mixed"): "bfloat16",
+}
+"""Values in plain words, by key and value."""
 WITHOUT_LPIPS = "not computed (evaluation.lpips=alex)"
 MOST_VIEWS = 12
 MOST_ROWS = 5000
@@ -72,7 +99,10 @@ def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     """Return protocol, origin and environment as pairs of texts."""
     titles = {"protocol": "Protocol", "origin": "Provenance", "environment": "Environment"}
     told = {key: list(mapping(metrics.get(key)).items())[:MOST_PAIRS] for key in titles}
-    pairs = {key: [(_name(name)[:80], _said(value)) for name, value in found] for key, found in told.items()}
+    pairs = {
+        key: [(ROWS.get((key, name), _name(name))[:80], _said(name, value)) for name, value in found]
+        for key, found in told.items()
+    }
     if pairs["protocol"] and metrics.get("lpips") is None:
         pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "LPIPS"), ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]
@@ -129,7 +159,9 @@ def _name(key: str) -> str:
     return NAMES.get(key, key.replace("_", " "))
 
 
-def _said(value: Any) -> str:
+def _said(name: str, value: Any) -> str:
+    if (words := WORDS.get((name, str(value)))) is not None:
+        return words
     if isinstance(value, int | float) and not isinstance(value, bool):
         return f"{value:,}"
     return "none" if value is None else as_text(value)[:300]

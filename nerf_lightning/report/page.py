@@ -17,6 +17,7 @@ from nerf_lightning.doctor.check import Check
 from nerf_lightning.files.html import data_address, json_in_page, write_page
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.report.coverage import CoverageMap
 from nerf_lightning.report.curves import Drawing
 from nerf_lightning.visualization.pictures import ERROR_SCALE
 
@@ -91,11 +92,13 @@ class Report:
     scene_page: str = ""
     """The address of the page of the scene (`nerf export what=page`)."""
     scene_page_age: str = ""
-    """What is said of a page that is older than the last checkpoint."""
+    """Which step the page shows, if not the last one."""
     exports: Pairs = field(default_factory=list)
     """Files for other programs: label and address."""
     result: str = ""
     """The result in a sentence, with what would improve it most; empty: unknown."""
+    command: str = ""
+    """The command that improves it; empty: none does."""
     facts: Pairs = field(default_factory=list)
     """The main numbers: label and value."""
     more_facts: Pairs = field(default_factory=list)
@@ -112,7 +115,7 @@ class Report:
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
     """What the doctor found."""
-    coverage: Embedded | None = None
+    coverage: CoverageMap | None = None
     split: str = "test"
     """Whose views `per_image` lists."""
     columns: list[str] = field(default_factory=list)

@@ -1,12 +1,13 @@
 """From a run folder to what its page shows. What cannot be read is left out, and the page says so."""
 
 import os
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
-from nerf_lightning.checkpoints.reading import newest_checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, newest_checkpoint
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.files.html import is_scene_page
 from nerf_lightning.files.json_files import mapping, read_json_object
@@ -14,11 +15,12 @@ from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.report.coverage import coverage_map
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.metrics import depth_scale, facts, per_image, tables, views_on_page
-from nerf_lightning.report.page import Report, embedded, embedded_file, embedded_video
+from nerf_lightning.report.page import Report, embedded_file, embedded_video
+from nerf_lightning.runs.file_steps import STEPS, read_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
-from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
 MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
@@ -27,7 +29,6 @@ SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
 LONGEST_RESULT = 2000
 VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
-EARLIER = "of an earlier checkpoint"
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
 
 
@@ -37,6 +38,7 @@ def read_run(
     most_video_bytes: int,
     examine: Callable[[], list[Check]] | None,
     folder: Path | None = None,
+    resume: str = "",
 ) -> Report:
     """Return all of a run that can be shown.
 
@@ -46,9 +48,10 @@ def read_run(
         most_video_bytes: a film that is larger is left out.
         examine: reads the capture and judges it, as the doctor does; None leaves that out.
         folder: where the page will lie; None: in the run folder.
+        resume: the setting that resumes this run, as typed in a shell; empty: no command is shown.
     """
     report = Report(title=run.absolute().name)
-    _add_exports(report, run / "export", (folder or run).absolute())
+    step: int | None = None
 
     @contextmanager
     def attempt(what: str) -> Iterator[None]:
@@ -62,10 +65,15 @@ def read_run(
 
     with StageProgress(COSTS) as progress:
         progress("views", 0.0)
-        _add_measured(report, run, metrics)
-        for step in _validation_pictures(run):
+        _add_measured(report, run, metrics, resume)
+        with attempt("Coverage"):
+            checkpoint = _last_checkpoint(run)
+            step = checkpoint.step
+            _add_capture(report, checkpoint, run)
+        _add_exports(report, run / "export", (folder or run).absolute(), step)
+        for picture in _validation_pictures(run):
             with attempt("A picture of the validation"):
-                report.steps.append((f"step {step.stem.partition('_')[2].lstrip('0')}", embedded_file(step)))
+                report.steps.append((f"step {picture.stem.partition('_')[2].lstrip('0')}", embedded_file(picture)))
         with attempt("Config"):
             _add_config(report, run)
         progress("curves", 0.0)
@@ -75,11 +83,10 @@ def read_run(
         for name, label in VIDEOS.items():
             if (run / name).is_file():
                 with attempt("Film"):
-                    age = f" ({EARLIER})" if _is_older(run / name, run) else ""
-                    report.videos.append((label + age, embedded_video(run / name, most_video_bytes)))
+                    age = _age(read_steps(run).get(name), step)
+                    film = embedded_video(run / name, most_video_bytes)
+                    report.videos.append((f"{label} ({age})" if age else label, film))
         progress("capture", 0.0)
-        with attempt("Coverage"):
-            _add_coverage(report, run)
         if examine is not None:
             with attempt("The doctor"):
                 report.checks = examine()
@@ -96,30 +103,29 @@ def address_from(file: Path, folder: Path) -> str:
     return f"./{quote(os.fsencode(Path(os.path.relpath(file, folder)).as_posix()))}"
 
 
-def _add_exports(report: Report, exported: Path, folder: Path) -> None:
-    """Link what nerf export wrote; of pages, only ours."""
-    run = exported.parent
-    files = [file for file in sorted(exported.glob("*")) if file.is_file() and file.suffix != ".html"]
+def _add_exports(report: Report, exported: Path, folder: Path, step: int | None) -> None:
+    """Link what nerf export wrote; of pages, only ours. `step` is the last checkpoint's, None if unknown."""
+    steps, files = read_steps(exported), sorted(exported.glob("*"))
+    files = [file for file in files if file.is_file() and file.suffix != ".html" and file.name != STEPS]
     for file in files[:MOST_EXPORTS]:
-        age = f", {EARLIER}" if _is_older(file, run) else ""
-        size = f"{file.stat().st_size / 1e6:.2g} MB{age}"
-        report.exports.append((f"{file.name} ({size})", address_from(file.absolute(), folder)))
+        note = ", ".join(filter(None, (f"{file.stat().st_size / 1e6:.2g} MB", _age(steps.get(file.name), step))))
+        report.exports.append((f"{file.name} ({note})", address_from(file.absolute(), folder)))
     page = exported / "page.html"
     if page.is_file() and is_scene_page(page):
         report.scene_page = address_from(page.absolute(), folder)
-        report.scene_page_age = EARLIER if _is_older(page, run) else ""
+        report.scene_page_age = _age(steps.get(page.name), step)
 
 
-def _is_older(file: Path, run: Path) -> bool:
-    """Return whether a file was written before the last checkpoint of the run, and shows less."""
-    last = run / "checkpoints" / "last.ckpt"
-    return last.is_file() and file.stat().st_mtime < last.stat().st_mtime
+def _age(shown: int | None, last: int | None) -> str:
+    """Return what to say of a file that shows an earlier step than the last checkpoint; "" where either is unknown."""
+    return "" if shown is None or last is None or shown >= last else f"of step {shown:,} of {last:,}"
 
 
-def _add_measured(report: Report, run: Path, file: Path) -> None:
+def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:
     metrics, note = read_json_object(file), read_note(run)
     report.subtitle = f"{run.absolute()}, started {str(note.get('started', 'at an unknown time')).replace('T', ' ')}"
     report.result = str(note.get("result", ""))[:LONGEST_RESULT]
+    report.command = _resume_command(resume, str(note.get("resume_with", ""))[:LONGEST_RESULT])
     known = facts(metrics, note)
     report.facts = [pair for pair in known if pair[0] in MAIN]
     report.more_facts = [pair for pair in known if pair[0] not in MAIN]
@@ -131,6 +137,16 @@ def _add_measured(report: Report, run: Path, file: Path) -> None:
         report.missing.append(f"Numbers: there is no {file.relative_to(run)} that can be read.")
     report.worst, report.views, missing = views_on_page(metrics, file.parent / "images")
     report.missing += missing
+
+
+def _resume_command(resume: str, settings: str) -> str:
+    """Return the command that trains longer, with the settings that `run.json` names."""
+    try:
+        words = shlex.split(settings)
+    except ValueError:  # a quote without its end
+        return ""
+    # Quoted anew: a stranger's settings do nothing else in a shell.
+    return " ".join(["nerf train", resume, *map(shlex.quote, words)]) if resume and words else ""
 
 
 def _validation_pictures(run: Path) -> list[Path]:
@@ -150,10 +166,14 @@ def _add_config(report: Report, run: Path) -> None:
     report.overrides = "\n".join(map(str, overrides)) if isinstance(overrides, list) else ""
 
 
-def _add_coverage(report: Report, run: Path) -> None:
+def _last_checkpoint(run: Path) -> Checkpoint:
     checkpoint = newest_checkpoint(run / "checkpoints")
     if checkpoint is None:
         raise InputError(f"{run} has no checkpoint")
+    return checkpoint
+
+
+def _add_capture(report: Report, checkpoint: Checkpoint, run: Path) -> None:
     record = checkpoint.scene
     report.title = scene_of_run(record.name, run)
     held = {split: record.splits.get(split, ()) for split in SPLITS}
@@ -162,4 +182,4 @@ def _add_coverage(report: Report, run: Path) -> None:
     counts = [f"{len(numbers)} {SPLITS[split]}" for split, numbers in held.items() if numbers]
     views = " and ".join(filter(None, (", ".join(counts[:-1]), *counts[-1:])))
     report.subtitle = f"model {checkpoint.choices.get('model', '')}, {views} views, {report.subtitle}"
-    report.coverage = embedded(coverage_picture(record).numpy())
+    report.coverage = coverage_map(record)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.world_frame import directions_seen, middle_of
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLOURS = {"train": "#2f6db3", "held out": "#e07b39"}
-CONTENT, BOX, GAP = "#8a8f98", "#3c9d6b", "#f3d9d6"
+CONTENT, BOX = "#8a8f98", "#3c9d6b"
+SEEN, UNSEEN = "#cfe6d4", "#eceef1"
 CELL, NEAR_ENOUGH = 3, 15.0  # Degrees of a cell of the coverage map, and within which of a camera it counts as seen
 MOST_POINTS = 4000
 
@@ -36,11 +37,13 @@ def draw_layout(above: "Axes", side: "Axes", scene: Scene, content: Float[Tensor
     _draw_cameras(side, scene, content, (2, 1) if flat else (0, 2), "from the side")
 
 
-def coverage_picture(scene: SceneRecord, width: int = 900, height: int = 460) -> UInt8[Tensor, "height width 3"]:
-    """Return only the coverage map, which needs the cameras but no photographs."""
-    figure = new_figure(width, height)
-    draw_coverage(figure.subplots(), scene)
-    return picture_of(figure)
+def seen_cells(scene: SceneRecord) -> Bool[Tensor, "rows columns"]:
+    """Return which cells of the map of directions, from azimuth and elevation -180, -90 on, a photograph is near."""
+    columns = torch.arange(-180 + CELL / 2, 180, CELL)
+    rows = torch.arange(-90 + CELL / 2, 90, CELL)
+    cells = _unit(*torch.meshgrid(columns, rows, indexing="xy"))
+    angle = (cells @ _unit(*directions_seen(scene)).T).clamp(-1, 1).amax(dim=-1).acos().rad2deg()
+    return angle <= NEAR_ENOUGH
 
 
 def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
@@ -51,20 +54,16 @@ def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
         _draw_directions(axes, scene)
         return
     azimuth, elevation = directions_seen(scene)
-    columns = torch.arange(-180 + CELL / 2, 180, CELL)
-    rows = torch.arange(-90 + CELL / 2, 90, CELL)
-    cells = _unit(*torch.meshgrid(columns, rows, indexing="xy"))
-    angle = (cells @ _unit(azimuth, elevation).T).clamp(-1, 1).amax(dim=-1).acos().rad2deg()
-    missing, colors = (angle > NEAR_ENOUGH).numpy(), ListedColormap(["#dcebdf", GAP])
+    seen, colors = seen_cells(scene).numpy(), ListedColormap([UNSEEN, SEEN])
     placed: dict[str, Any] = {"extent": (-180, 180, -90, 90), "origin": "lower", "aspect": "auto"}
-    axes.imshow(missing, cmap=colors, vmin=0, vmax=1, interpolation="nearest", **placed)
-    for split, views in _splits(scene).items():
+    axes.imshow(seen, cmap=colors, vmin=0, vmax=1, interpolation="nearest", **placed)
+    for split, views in views_by_split(scene).items():
         at = list(views)
         dots: dict[str, Any] = {"s": 16, "color": COLOURS[split], "edgecolors": "white", "lw": 0.4, "label": split}
         axes.scatter(azimuth[at].numpy(), elevation[at].numpy(), **dots)
     axes.axhline(0, color="0.6", linewidth=0.7)
     axes.legend(loc="lower left", fontsize=7, framealpha=0.8)
-    title = f"coverage: green is within {NEAR_ENOUGH:.0f} degrees of a photograph, red is not"
+    title = f"coverage: green is within {NEAR_ENOUGH:.0f} degrees of a photograph"
     axes.set_xticks(range(-180, 181, 45))
     axes.set_yticks(range(-90, 91, 30))
     _style(axes, title, "azimuth around the middle (degrees)", "elevation (degrees)")
@@ -84,7 +83,7 @@ def _draw_cameras(
         low, high = scene.aabb[:, dims].numpy()
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
         axes.add_collection(PolyCollection([corners], facecolor="none", edgecolor=BOX, linewidth=1.6, label="box"))
-    for split, views in _splits(scene).items():
+    for split, views in views_by_split(scene).items():
         lines = np.concatenate([_frustum(scene, view, 0.13 * size)[:, :, dims] for view in views])
         axes.add_collection(LineCollection(list(lines), colors=COLOURS[split], linewidths=0.8, alpha=0.8, zorder=2))
         label = f"{split} ({len(views)})"
@@ -125,7 +124,7 @@ def _frustum(scene: Scene, view: int, length: float) -> Float[np.ndarray, "lines
 def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
     # Forward-facing: what matters is the extent of the cameras' positions.
     x, y, _ = scene.cameras.c2w[:, :, 3].unbind(dim=-1)
-    for split, views in _splits(scene).items():
+    for split, views in views_by_split(scene).items():
         at = list(views)
         axes.scatter(x[at].numpy(), y[at].numpy(), s=30, color=COLOURS[split], edgecolors="white", lw=0.5)
     axes.set_aspect("equal", adjustable="box")
@@ -135,7 +134,8 @@ def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
     _style(axes, "coverage: where the cameras stood, seen from behind them", "x (scene units)", "y")
 
 
-def _splits(scene: SceneRecord) -> dict[str, list[int]]:
+def views_by_split(scene: SceneRecord) -> dict[str, list[int]]:
+    """Return the training views and those held out for validation or test."""
     held = sorted(set(scene.splits.get("val", ())) | set(scene.splits.get("test", ())))
     return {"train": list(scene.splits["train"]), "held out": held}
 

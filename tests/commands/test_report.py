@@ -4,6 +4,7 @@ import html
 import itertools
 import json
 import re
+import shlex
 import shutil
 
 import pytest
@@ -13,6 +14,8 @@ from support.running import done, output_of, said, start
 from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.commands import report
+from nerf_lightning.report.read_run import _resume_command
+from nerf_lightning.runs.file_steps import read_steps
 
 TERMS = [f"photo_distortion_{number}" for number in range(7)]  # A legend that needs several lines on phones
 
@@ -43,6 +46,13 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     result = json.loads((finished_run / "run.json").read_text())["result"]
     assert re.search(r"dB on held-out photographs, .+ To improve it, .+\.", result)
     assert html.unescape(re.search(r'<p id="result">(.+)</p>', text)[1]) == result
+    # The page was made from a copy: its command names the copy.
+    assert f'<pre id="command">nerf train resume={path.parent / "run"} ' in text
+    assert str(finished_run) not in text[: text.index("<h2")]
+    assert text.count("Depths have one scale") == 1
+    assert "</video>" in text
+    assert read_steps(finished_run) == dict.fromkeys(("video.mp4", "depth.mp4", "progress.mp4"), 20)
+    assert "of step" not in text
     stamps = metrics["protocol"]["split_hash"], metrics["origin"]["checkpoint"], metrics["environment"]["torch"]
     for shown in (f"{metrics['psnr']:.2f} dB", *stamps, "trainer.max_steps=20", "near and far"):
         assert shown in text, shown
@@ -126,6 +136,14 @@ def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
     assert sections(text) == ["missing"]
     for what in ("Numbers", "Curves", "Coverage", "The doctor", "Config"):
         assert f"<li>{what}: " in text
+
+
+@pytest.mark.parametrize("told", ["$(touch evil)", "a;touch evil", "`touch evil`", "a\ntouch evil"])
+def test_a_strangers_settings_do_nothing_else_in_a_shell(told):
+    words = shlex.split(_resume_command("resume=run", told))
+    assert words[:3] == ["nerf", "train", "resume=run"]
+    assert "'" in _resume_command("resume=run", told) or "\n" in told
+    assert _resume_command("resume=run", "'") == _resume_command("resume=run", "") == ""
 
 
 def test_what_is_no_run_is_refused(nerf, tmp_path):

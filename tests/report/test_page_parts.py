@@ -1,11 +1,15 @@
 import base64
 import io
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.shiny_ball import all_around, record_of
 
+from nerf_lightning.report.coverage import coverage_map
 from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
 from nerf_lightning.report.metrics import WITHOUT_LPIPS, depth_scale, facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
@@ -45,13 +49,35 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
     assert (psnr.label, psnr.note) == ("PSNR (dB)", "")
     assert [curve["label"] for curve in psnr.curves] == ["training", "validation"]
     assert psnr.curves[0]["values"] == [10.0, 20.0, 25.0]
-    two = curve_drawings({f"PSNR/train_{level}": (steps, [1.0, 2.0, 3.0]) for level in ("coarse", "fine")})
+    two = curve_drawings(
+        {f"PSNR/train_{level}": (steps, [1.0, 2.0, end]) for level, end in (("coarse", 3.0), ("fine", 4.0))}
+    )
     assert [curve["label"] for curve in two[0].curves] == ["training (coarse)", "training (fine)"]
     assert curve_drawings({}) == []
 
 
+def test_equal_curves_are_drawn_once_under_both_names():
+    losses = {"proposal": 1.0, "interlevel": 1.0, "fine": 2.0}
+    (drawing,) = curve_drawings({f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()})
+    assert [curve["label"] for curve in drawing.curves] == ["fine", "interlevel = proposal"]
+
+
+@pytest.mark.parametrize("space", ["contracted", "ndc"])
+def test_the_coverage_map_has_a_dot_in_it_for_each_view_and_no_letters_in_its_picture(tmp_path, space):
+    record = replace(record_of(all_around()), space=space)
+    found = coverage_map(record)
+    dots = [dot for _, _, dots in found.splits for dot in dots]
+    assert len(found.splits[0][2]) == len(record.splits["train"])
+    assert all(0 <= x <= found.width and 0 <= y <= found.height for x, y in dots)
+    assert bool(found.seen) == (space != "ndc")
+    write_report(Report("a run", coverage=found), tmp_path / "report.html")
+    drawing = re.search(r'<svg viewBox="0 0 360.+?</svg>', (tmp_path / "report.html").read_text(), re.DOTALL)[0]
+    assert "<text" not in drawing
+    assert drawing.count("<circle") == len(dots)
+
+
 def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
-    curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
+    curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0 + number]) for number in range(3000)}
     (drawing,) = curve_drawings(curves)
     assert len(drawing.curves) == MOST_CURVES
     assert drawing.note == "2988 more curves are in the run's TensorBoard files."
@@ -83,6 +109,8 @@ def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():
     origin = {"parameters": 12525764, "megabytes": 50.1, "seed": 0, "tied": False}
     found = tables({"origin": origin, "protocol": {"psnr": "mean of the pictures' own"}})
     assert [text for _, text in dict(found)["Provenance"]] == ["12,525,764", "50.1", "0", "False"]
+    plain = dict(tables({"protocol": {"pixels": "float", "cameras": "raw", "hold_every": "8"}}))["Protocol"]
+    assert plain[:2] == [("colors of the render", "not rounded"), ("cameras", "as given")]
     assert ("PSNR", "mean over the pictures") in dict(found)["Protocol"]
     columns, rows = per_image({"per_image": [{"name": "a", "psnr": 28.5, "cc_psnr": 29}]})
     assert (columns, rows) == (["name", "PSNR", "PSNR with fitted colors"], [["a", "28.50 dB", "29.00 dB"]])

@@ -21,6 +21,7 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.nerf.models.base import Model, point_field, show_photographs
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.file_steps import record_steps
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.video.encoding import require_ffmpeg, write_video
@@ -30,7 +31,7 @@ from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, lay_path
 from nerf_lightning.visualization.pictures import at_most
 
-PROGRESS_FPS = 4
+PROGRESS, PROGRESS_FPS = "progress.mp4", 4
 MOST_NAMED = 10
 
 
@@ -92,7 +93,9 @@ class PostTraining:
                 shown = FilmSettings(precision=settings.precision)
                 video, depth = film([subject], self.path, tile_points, folder, shown)
                 lines += [f"video        {video}", f"depth        {depth}"]
-                lines += _film_progress(folder) if ranks.is_first() else []
+                if ranks.is_first():
+                    lines += _film_progress(folder)
+                    record_steps(folder, [video, depth, folder / PROGRESS], trainer.global_step)
         lines += moved
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
         if (folder / "tensorboard").is_dir():
@@ -127,5 +130,5 @@ def _film_progress(folder: Path) -> list[str]:
     if len(files) < 2:
         return []
     frames = [at_most(torch.from_numpy(read_rgba(file)[..., :3].copy())) for file in files]
-    write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
-    return [f"progress     {folder / 'progress.mp4'}"]
+    write_video(folder / PROGRESS, frames, PROGRESS_FPS, len(frames))
+    return [f"progress     {folder / PROGRESS}"]

@@ -160,5 +160,9 @@ def trust_setting(job: TrainJob) -> str:
 
 def resume_command(folder: Path) -> str:
     """Return the command that resumes a run."""
-    again = to_give_again(HydraConfig.get().overrides.task)
-    return " ".join(["nerf train", to_type("resume", str(folder)), *map(shlex.quote, searchpath_override()), *again])
+    return " ".join(["nerf train", to_type("resume", str(folder)), *resume_settings()])
+
+
+def resume_settings() -> list[str]:
+    """Return the settings that resuming needs again, besides the folder, as typed in a shell."""
+    return [*map(shlex.quote, searchpath_override()), *to_give_again(HydraConfig.get().overrides.task)]

@@ -16,7 +16,7 @@ from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.commands.export import write_files
 from nerf_lightning.commands.train_job.build import TrainJob
-from nerf_lightning.commands.train_job.fit import resume_command, trust_setting
+from nerf_lightning.commands.train_job.fit import resume_command, resume_settings, trust_setting
 from nerf_lightning.commands.train_job.held_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import CPU_SECONDS
@@ -32,6 +32,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
+from nerf_lightning.runs.file_steps import record_steps
 from nerf_lightning.runs.summary import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 
@@ -54,8 +55,10 @@ def show(job: TrainJob, held: HeldFolder, trainer: Trainer, psnr: float | None) 
         logger.finalize("success")
     if not ranks.is_first():
         return
-    folder, result = held.path, _result(job, held.path, psnr, trainer.global_step)
-    held.note(result=result)
+    folder = held.path
+    result, length = _result(job, folder, psnr, trainer.global_step)
+    longer = " ".join([*resume_settings(), length]) if length else ""
+    held.note(result=result, resume_with=longer)
     lines = profile_lines(trainer)
     if lines:
         say(*lines)
@@ -66,9 +69,13 @@ def show(job: TrainJob, held: HeldFolder, trainer: Trainer, psnr: float | None) 
     if job.config.final.report:
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
-        report = read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine)
+        report = read_run(
+            folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine, resume=to_type("resume", str(folder))
+        )
         write_report(report, target)
         say(f"result       {target}: {result}")
+    if length:
+        say(f"train longer {resume_command(folder)} {length}")
     say(f"look at it   {_program()} view {to_type('ckpt', str(folder))} {trust_setting(job)}".rstrip())
 
 
@@ -78,18 +85,17 @@ def _program() -> str:
     return "nerf" if shutil.which("nerf") or not beside.is_file() else os.path.relpath(beside)
 
 
-def _result(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> str:
-    """Return the result in a sentence, and what would improve it most."""
+def _result(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> tuple[str, str]:
+    """Return the result in a sentence with what would improve it most, and, if that is training, how long."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
     quality = "" if psnr is None else f"{psnr:.1f} dB on held-out {what}, "
     length = (
         f"trainer.max_steps={2 * steps}" if seconds is None else f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
     )
-    cure = f"train longer ({resume_command(folder)} {length})."
-    if not _still_learns(job, folder, psnr, steps):
-        cure = advice(job.checks or ()) or cure
-    return f"{quality}{used} of {total} {what} used. To improve it, {cure[0].lower()}{cure[1:]}"
+    cure = None if _still_learns(job, folder, psnr, steps) else advice(job.checks or ())
+    cure, length = ("train longer.", length) if cure is None else (f"{cure[0].lower()}{cure[1:]}", "")
+    return f"{quality}{used} of {total} {what} used. To improve it, {cure}", length
 
 
 def _still_learns(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> bool:
@@ -119,6 +125,7 @@ def export_trained(name: str, what: Export, job: TrainJob, folder: Path) -> None
         path.update(PATH)
         target = make_folder(folder, "export")
         written = write_files(what, trained, as_known(job.scene, trained), build(path), target)
+        record_steps(target, written, checkpoint.step)
         say(*(f"{name:<12} {file}" for file in written))
     except Exception as error:  # out of GPU memory, a full disk, a broken compiler: the run is complete all the same
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"

@@ -20,6 +20,7 @@ from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.files.html import SCENE_PAGE
 from nerf_lightning.report.page import Report
 from nerf_lightning.report.read_run import _add_exports
+from nerf_lightning.runs.file_steps import read_steps, record_steps
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
@@ -57,7 +58,11 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     report = (exported.parent / "report.html").read_text()
     assert 'href="./export/page.html">Open the 3D scene' in report
     assert 'href="./export/transforms.json">transforms.json (0.' in report
-    *_, last, view = result.out.splitlines()
+    assert "of step" not in report
+    assert "steps.json" not in report
+    assert read_steps(exported) == {"page.html": 4, "transforms.json": 4, "sparse": 4}
+    *_, last, longer, view = result.out.splitlines()
+    assert longer.startswith(f"train longer nerf train resume={exported.parent} ")
     assert re.fullmatch(rf"look at it   \S*nerf view ckpt={exported.parent}", view)
     found = rf"result +{exported.parent}/report.html: .*\b(\d+) of \1 photographs used. To improve it, .+\."
     assert re.fullmatch(found, last), last
@@ -73,15 +78,14 @@ MEMORIZED = [5.0 + value for value in RISING]  # the training views alone
 @pytest.mark.parametrize(
     ("steps", "curve", "cure"),
     [
-        (43, FLAT, "train longer (nerf train resume=run budget.seconds=300)."),
-        (4000, RISING, "train longer (nerf train resume=run budget.seconds=300)."),
+        (43, FLAT, "train longer."),
+        (4000, RISING, "train longer."),
         (4000, FLAT, "take 6 more photographs."),
         (4000, MEMORIZED, "take 6 more photographs."),
     ],
 )
 def test_longer_training_is_advised_before_more_photographs_while_it_helps(monkeypatch, steps, curve, cure):
     monkeypatch.setattr(show, "read_curves", lambda folder: {"PSNR/train_fine": (range(100), curve)})
-    monkeypatch.setattr(show, "resume_command", lambda folder: f"nerf train resume={folder}")
     job = create_autospec(
         TrainJob,
         instance=True,
@@ -90,23 +94,23 @@ def test_longer_training_is_advised_before_more_photographs_while_it_helps(monke
         checks=[Check("coverage", "look", "a gap", "Take 6 more photographs.")],
         system=SimpleNamespace(model=SimpleNamespace(level_names=("proposal", "fine"))),
     )
-    line = show._result(job, Path("run"), 20.6, steps)
+    line, length = show._result(job, Path("run"), 20.6, steps)
+    assert length == ("budget.seconds=300" if "train" in cure else "")
     assert line.endswith(f"20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it, {cure}")
 
 
-@pytest.mark.parametrize(("age", "of"), [(-60, "of an earlier checkpoint"), (60, "")])
-def test_what_was_exported_before_the_last_checkpoint_is_not_taken_for_its(tmp_path, age, of):
-    for name, content in {
-        "checkpoints/last.ckpt": b"",
-        "export/page.html": SCENE_PAGE,
-        "export/points.ply": b"",
-    }.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(content)
-    for file in (tmp_path / "export").iterdir():
-        os.utime(file, ns=(0, (tmp_path / "checkpoints/last.ckpt").stat().st_mtime_ns + age * 10**9))
+@pytest.mark.parametrize(
+    ("shown", "last", "of"), [(200, 1270, "of step 200 of 1,270"), (270, 270, ""), (None, 270, ""), (200, None, "")]
+)
+def test_the_report_says_which_step_an_export_shows_if_that_is_known_and_not_the_last(tmp_path, shown, last, of):
+    files = [tmp_path / "export" / name for name in ("page.html", "points.ply")]
+    files[0].parent.mkdir()
+    for file, content in zip(files, (SCENE_PAGE, b""), strict=True):
+        file.write_bytes(content)
+    if shown is not None:
+        record_steps(files[0].parent, files, shown)
     report = Report("a run")
-    _add_exports(report, tmp_path / "export", tmp_path)
+    _add_exports(report, tmp_path / "export", tmp_path, last)
     assert (report.scene_page, report.scene_page_age) == ("./export/page.html", of)
     assert report.exports == [(f"points.ply (0 MB{of and ', '}{of})", "./export/points.ply")]
 
