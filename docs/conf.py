@@ -23,7 +23,7 @@ html_extra_path = ["llms.txt"]
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_js_files = [("site.js", {"defer": "defer"})]
-exclude_patterns = ["_build", "README.md"]
+exclude_patterns = ["_build", "jupyter_execute", "README.md"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 # Links to source files, which the site does not have; tests/test_documents.py checks that they exist.

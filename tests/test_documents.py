@@ -295,6 +295,30 @@ def test_tables_fit_into_the_page_and_formulas_wrap_or_scroll_in_their_own_boxes
                 assert driver.execute_script(FORMULAS) == [], page
 
 
+PICTURES = """
+const faults = [...document.querySelectorAll("article p > img")]
+    .filter(image => image.parentElement.nextElementSibling?.textContent !== image.alt).map(image => image.src);
+const scrolls = box => box.scrollWidth > box.clientWidth + 1;
+return [...faults, ...[...document.querySelectorAll("article pre")].filter(scrolls).map(box => box.textContent)];
+"""
+
+
+@pytest.mark.minutes
+@pytest.mark.parametrize("page", ["export", "models", "course_1_image", "course_2_rays", "course_3_scene"])
+def test_pictures_have_captions_and_code_does_not_scroll_sideways(site, page):
+    with opened((site / f"{page}.html").as_uri()) as driver:
+        for size in ("desktop", "phone"):
+            layout_faults(driver, size)
+            assert driver.execute_script(PICTURES) == [], size
+
+
+def test_results_name_their_machines():
+    results = (ROOT / "docs" / "measurements.md").read_text(encoding="utf-8")
+    machines = set(re.findall(r"\| (EPYC|Xeon \w) \|", results))
+    assert machines == {"EPYC", "Xeon A", "Xeon B"}
+    assert results.count("Intel") == 2  # where these are explained
+
+
 SMALLER = (
     (r"resolution=\d+", "resolution=16"),
     (r"num_train=\d+", "num_train=6"),

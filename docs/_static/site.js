@@ -1,13 +1,16 @@
-/* Tables: where long code may break, and which ones do not fit into the page (site.css stacks their rows on phones). */
-const LONG = 24; // Shorter words of code (characters) stay whole.
+/* Where long code may break, which tables do not fit into the page (site.css stacks their rows on phones), captions. */
+const LONG = {td: 24, "": 36}; // Shorter words of code (characters) stay whole, in tables and elsewhere: a line of a phone.
+const SHORT = 12; // Characters of cells that share a line where rows are stacked.
 const LABELED = 4; // Rows of fewer columns need no names of columns.
 const tables = [...document.querySelectorAll("table.docutils")];
 const columns = table => [...table.querySelectorAll("thead th")].map(cell => cell.textContent.trim());
 const tooWide = table => table.scrollWidth > table.parentElement.clientWidth;
 
-function mayBreak(text) {
-  const parts = text.data.split(/(?<=[/._=,:])(?=\w{3})/);
-  text.replaceWith(...parts.flatMap((part, number) => (number ? [document.createElement("wbr"), part] : [part])));
+function mayBreak(text, long) {
+  text.replaceWith(...text.data.split(/(?<=\s)(?=\S)/).flatMap(word => {
+    const parts = word.length > long ? word.split(/(?<=[/._=,:@])(?=\w{3})/) : [word];
+    return parts.flatMap((part, number) => (number ? [document.createElement("wbr"), part] : [part]));
+  }));
 }
 
 function markWide() {
@@ -17,18 +20,26 @@ function markWide() {
   for (const table of tables) table.classList.toggle("wide", wide.has(String(columns(table))));
 }
 
-for (const code of document.querySelectorAll("td code")) {
-  const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [];
+for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
+  const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [], long = LONG[code.closest("td") ? "td" : ""];
   while (walk.nextNode()) texts.push(walk.currentNode);
-  texts.filter(text => text.length > LONG).forEach(mayBreak); // Each word has a text of its own.
+  texts.filter(text => text.length > long).forEach(text => mayBreak(text, long));
 }
 for (const table of tables) {
   const names = columns(table);
   for (const row of table.querySelectorAll("tbody tr"))
     [...row.cells].forEach((cell, column) => {
       cell.classList.toggle("blank", !cell.textContent.trim() && !cell.querySelector("img"));
-      if (column && names.length >= LABELED && names[column]) cell.dataset.column = names[column];
+      if (!column || names.length < LABELED || !names[column]) return;
+      cell.dataset.column = names[column];
+      cell.classList.toggle("short", cell.textContent.trim().length <= SHORT);
     });
+}
+// What a picture shows, below it; figures of notebooks have titles.
+for (const image of document.querySelectorAll("article p > img:only-child")) {
+  const caption = document.createElement("figcaption");
+  caption.textContent = image.alt;
+  image.parentElement.after(caption);
 }
 addEventListener("resize", markWide);
 markWide();
