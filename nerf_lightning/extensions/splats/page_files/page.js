@@ -229,8 +229,14 @@ function place({ view, turning }) {
   const edges = { left, top, right: left + box.width, bottom: top + box.height };
   for (const [name, pixels] of Object.entries(edges)) around.style.setProperty(`--${name}`, `${pixels}px`);
   for (const [name, pixels] of Object.entries(box)) frame.style[name] = `${pixels}px`;
-  frame.style.setProperty("--at", `${byId("wipe").value}%`);
-  byId("seam").hidden = ["0", "100"].includes(byId("wipe").value);
+  // The middle of the slider's thumb; at its ends there is one picture alone.
+  const share = Number(byId("wipe").value) / 100, alone = share === 0 || share === 1;
+  const [ofPhotograph, ofRender] = frame.querySelectorAll("span");
+  frame.style.setProperty("--at", alone ? `${100 * share}%` : `calc(${14 - 28 * share}px + ${100 * share}%)`);
+  byId("seam").hidden = alone;
+  ofPhotograph.hidden = share === 0;
+  ofRender.hidden = share === 1;
+  ofRender.textContent = byId("shown").options[view.shown].text.replace("Color", "Render");
   if (source && photograph.src !== source) photograph.src = source;
 }
 
