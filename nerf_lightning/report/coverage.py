@@ -18,7 +18,7 @@ class CoverageMap(NamedTuple):
 
     caption: str
     height: float
-    seen: str
+    covered: str
     """The path (SVG) around what was seen; empty: the map has dots alone."""
     splits: list[tuple[str, str, list[Dot]]]
     """Label, color and dots of each split."""
@@ -79,14 +79,14 @@ def _dots(scene: SceneRecord, x: torch.Tensor, y: torch.Tensor) -> list[tuple[st
     ]
 
 
-def _row(top: int, seen: list[bool]) -> str:
+def _row(top: int, covered: list[bool]) -> str:
     """Return rectangles over neighboring cells of a row that were seen.
 
     >>> _row(0, [False, True, True, False])
     'M3 0h6v3h-6z'
     """
     path, start = "", 0
-    for column, cell in enumerate([*seen, False]):
+    for column, cell in enumerate([*covered, False]):
         if not cell:
             width = CELL * (column - start)
             path += f"M{CELL * start} {top}h{width}v{CELL}h-{width}z" if width else ""

@@ -116,9 +116,9 @@ def _add_exports(report: Report, exported: Path, folder: Path, step: int | None)
         report.scene_page_age = _age(steps.get(page.name), step)
 
 
-def _age(shown: int | None, last: int | None) -> str:
+def _age(step: int | None, last: int | None) -> str:
     """Return what to say of a file that shows an earlier step than the last checkpoint; "" where either is unknown."""
-    return "" if shown is None or last is None or shown >= last else f"of step {shown:,} of {last:,}"
+    return "" if step is None or last is None or step >= last else f"of step {step:,} of {last:,}"
 
 
 def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:

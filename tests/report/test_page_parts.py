@@ -69,7 +69,7 @@ def test_the_coverage_map_has_a_dot_in_it_for_each_view_and_no_letters_in_its_pi
     dots = [dot for _, _, dots in found.splits for dot in dots]
     assert len(found.splits[0][2]) == len(record.splits["train"])
     assert all(0 <= x <= found.width and 0 <= y <= found.height for x, y in dots)
-    assert bool(found.seen) == (space != "ndc")
+    assert bool(found.covered) == (space != "ndc")
     write_report(Report("a run", coverage=found), tmp_path / "report.html")
     drawing = re.search(r'<svg viewBox="0 0 360.+?</svg>', (tmp_path / "report.html").read_text(), re.DOTALL)[0]
     assert "<text" not in drawing
