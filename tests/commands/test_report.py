@@ -104,6 +104,8 @@ def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
         driver.set_script_timeout(60)
         color, depth_and_scale, progress = driver.execute_async_script(script)
         assert color == progress == 16 < depth_and_scale
+        gap = "const [a, b] = document.querySelectorAll('.chart:nth-child(2) .legend span');"
+        assert run(gap + "return b.getBoundingClientRect().left - a.getBoundingClientRect().right") > 5
         unfold = "document.querySelectorAll('details').forEach(each => { each.open = true; })"
         for size in SIZES:
             assert layout_faults(driver, size) == layout_faults(driver, size, unfold) == []
