@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_backend
+from nerf_lightning.nerf.kernels.backends import with_kernel
 from nerf_lightning.nerf.randomness import WORD, fold, mix
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
@@ -25,15 +25,15 @@ def shares(store: PixelStore) -> UInt8[Tensor, "pixels"]:
     Differences are of colors times alpha, and of alpha, in the channel where they are largest.
     """
     out = torch.zeros(len(store.rgba), dtype=torch.uint8, device=store.rgba.device)
-    kernels = cpu_backend("pixels.cpu", out.device)
     for view in range(len(store.width)):
         picture, mask = store.view(view), store.view_mask(view)
-        share = contrast(picture) if kernels is None else kernels.contrast(picture)
+        share = contrast(picture)
         start = int(store.offset[view])
         out[start : start + share.numel()] = (share if mask is None else share * mask).flatten()
     return out
 
 
+@with_kernel("pixels.cpu")
 def contrast(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "height width"]:
     """Return the shares of a picture's pixels, none of which is masked."""
     color = rgba.to(torch.int32)

@@ -20,7 +20,6 @@ VALUES = (
 FREE = {  # Names of this program, numbers, digests; files that are read as they are named
     "checkpoints": {"path.with_name(name)", "target.with_name(PREVIOUS)"},
     "cli": {"SCRIPTS / f'nerf.{shell}'"},
-    "commands": {"folder / f'table{ending}'"},
     "config": {"PACKAGE.joinpath(*module.split('.')[1:])"},
     "data": {
         "folder / f'{key}.npz'",
@@ -36,6 +35,7 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
     },
     "evaluation": {"folder / f'{part}.png'"},
     "extensions": {
+        "folder / f'table{ending}'",
         *("keyframes / 'depth' / f'{path.stem}.png'", "folder / 'pose' / f'{stem}.txt'"),
         *("folder / 'intrinsics' / f'{stem}.txt'", "picture.with_name(picture.name.replace('frame', 'depth'))"),
         "path.with_name(layout.depth.format(path.stem.removeprefix(before)))",

@@ -32,6 +32,7 @@ OURS = {
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "files/html.py": ["read_text"],
+    "extensions/viewer/controls.py": ["read_text"],
     "extensions/table/published.py": ["read_text", "safe_load"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_bytes", "read_text"],

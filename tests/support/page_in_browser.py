@@ -7,7 +7,7 @@ from unittest import mock
 import numpy as np
 import torch
 from PIL import Image
-from support.shiny_ball import read_page
+from support.splat_page import read_page
 
 from nerf_lightning.extensions.splats import gaussians
 from nerf_lightning.extensions.splats.gaussians import Pinhole

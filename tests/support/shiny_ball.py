@@ -1,19 +1,12 @@
-"""A ball whose color depends on where it is seen from, and its page."""
+"""A ball whose color depends on where it is seen from."""
 
-import base64
-import gzip
-import json
-import re
-from dataclasses import fields, replace
+from dataclasses import replace
 
-import numpy as np
 from support.known_fields import SolidField, ball
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.base import RunContext
-from nerf_lightning.extensions.splats.gaussians import Gaussians
-from nerf_lightning.extensions.splats.quantized import QuantizedSplats
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -48,13 +41,3 @@ def record_of(scene, **changes):
 
 def run_of(scene, *facts) -> RunContext:
     return RunContext(scene, facts=tuple(facts))
-
-
-def read_page(page) -> tuple[dict, Gaussians]:
-    """What a page says of its scene, and the splats in it."""
-    text = page.read_text()
-    about, packed = (re.search(rf'id="{name}">([^<]*)</script>', text)[1] for name in ("about", "splats"))
-    about, planes = json.loads(about), np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.uint8)
-    known = {field.name: about[field.name] for field in fields(QuantizedSplats) if field.name != "content"}
-    known |= {name: tuple(known[name]) for name in ("scales", "colors")}
-    return about, QuantizedSplats(**known, content=planes.reshape(-1, about["splats"])).gaussians()

@@ -32,7 +32,7 @@ class DenseLevel(Level):
     sampler: DenseSampler
     sampler_kind = DenseSampler
     takes_coupled_fields = True
-    kernels = (DENSE, "mlp.cpu", "hash_grid.cpu", "histograms.cpu", "random.cpu", "table_adam.cpu")
+    kernels = (DENSE, "mlp.cpu", "hash_grid.cpu", "histograms.cpu", "random.cpu", "pixels.cpu", "table_adam.cpu")
 
     def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
         super().__init__(sampler, field)

@@ -47,7 +47,7 @@ class RaggedLevel(Level):
     has_static_shapes = False
     kernels = (
         *(LEARNING, RENDERING, "mlp.cpu", "hash_grid.cpu", "carving.cpu"),
-        *("march.cpu", "random.cpu", "table_adam.cpu"),
+        *("march.cpu", "random.cpu", "pixels.cpu", "table_adam.cpu"),
     )
 
     def __init__(self, sampler: Sampler, field: Field):

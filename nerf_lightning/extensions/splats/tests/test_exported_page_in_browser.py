@@ -19,7 +19,8 @@ from support.page_in_browser import (
     wait_for,
     wait_until_there,
 )
-from support.shiny_ball import all_around, read_page, record_of, run_of, shiny_model
+from support.shiny_ball import all_around, record_of, run_of, shiny_model
+from support.splat_page import read_page
 
 from nerf_lightning.commands.export import page_path
 from nerf_lightning.config.compose import compose_config

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from support.running import refused
-from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
+from support.shiny_ball import RADIUS, all_around, record_of, run_of, shiny_model
+from support.splat_page import read_page
 
 from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.files.html import is_scene_page

@@ -9,7 +9,8 @@ import pytest
 import torch
 from support.browser import drag, opened
 from support.page_in_browser import drawn, hide_controls, name_it, press, psnr, shot, wait_for, wait_until_there
-from support.shiny_ball import RADIUS, all_around, read_page, record_of, run_of, shiny_model
+from support.shiny_ball import RADIUS, all_around, record_of, run_of, shiny_model
+from support.splat_page import read_page
 
 from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.nerf.geometry.world_frame import similarity

@@ -73,10 +73,10 @@ VARIES = ["several", "first", "key", "chooser", "count", "known_first", "known_k
 
 @triton.jit
 @no_type_check
-def _number(place, size, rows, columns, key, valid, rounds: tl.constexpr):
+def _number(position, size, rows, columns, key, valid, rounds: tl.constexpr):
     """Return what is at places of the order (`randomness.permute`)."""
-    epoch = place // size
-    number = place - epoch * size
+    epoch = position // size
+    number = position - epoch * size
     start = mix(key ^ mix(epoch.to(tl.uint32)) ^ 0x5A5A5A5A)
     walks = valid
     while tl.max(walks.to(tl.int32), axis=0) > 0:
@@ -128,22 +128,22 @@ def _batch(
     rows = tl.where(is_known, known_rows, rows).to(tl.int64)
     columns = tl.where(is_known, known_columns, columns).to(tl.int64)
     key = tl.where(is_known, known_key, key).to(tl.uint32)
-    place = tl.where(is_known, index - several + known_first, (index + first) * candidates)
+    position = tl.where(is_known, index - several + known_first, (index + first) * candidates)
     numbered = valid & ~is_known
-    number = _number(place, size, rows, columns, key, valid, rounds)
+    number = _number(position, size, rows, columns, key, valid, rounds)
     view, x, y = _pixel(number, ends, across, views, left, top, slots, steps, numbered, block)
     kept = tl.full([block], 1.0, tl.float32)
     if candidates > 1:
         total = tl.zeros([block], tl.int64)
         share = tl.zeros([block], tl.int64)
         for each in range(candidates):
-            other = _number(place + each, size, rows, columns, key, numbered, rounds)
+            other = _number(position + each, size, rows, columns, key, numbered, rounds)
             view_of, x_of, y_of = _pixel(other, ends, across, views, left, top, slots, steps, numbered, block)
             flat = tl.load(offset + view_of, mask=numbered, other=0)
             flat += y_of * tl.load(width + view_of, mask=numbered, other=0) + x_of
             own = tl.load(shares + flat, mask=numbered, other=0).to(tl.int64)
             total += own
-            word = mix((place + each).to(tl.uint32) ^ chooser.to(tl.uint32))
+            word = mix((position + each).to(tl.uint32) ^ chooser.to(tl.uint32))
             taken = numbered & ((word >> 8).to(tl.int64) * total < (own << 24))
             view, x, y = tl.where(taken, view_of, view), tl.where(taken, x_of, x), tl.where(taken, y_of, y)
             share = tl.where(taken, own, share)
