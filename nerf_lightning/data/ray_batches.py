@@ -7,9 +7,10 @@ number of rays seen is stored, so a resumed run continues exactly where it stopp
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.compute import ranks
@@ -137,18 +138,22 @@ class RayBatches:
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device for which a background thread makes batches; None: no such thread.
         self.prefetch_for: torch.device | None = None
-        self.shares = shares(scene.pixels) if self.candidates > 1 else None
         self.take_from(scene)
         self.num_steps = self.epoch_steps
 
     def take_from(self, scene: Scene) -> None:
         """Make batches from this copy of the scene, whose pixels are in memory, in a mapped file, or on a device."""
         self.scene = scene
-        self.shares = None if self.shares is None else self.shares.to(scene.pixels.rgba.device)
+        vars(self).pop("shares", None)  # those of pixels elsewhere
         self.whole = PixelDomain(scene, scene.splits["train"], patch=self.patch)
         self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction, self.patch)
         depths = DepthRays(scene, self.patch) if self.depth_every and scene.depths is not None else None
         self.depths = depths if depths is not None and len(depths) else None
+
+    @cached_property
+    def shares(self) -> UInt8[Tensor, "pixels"] | None:
+        """The shares of pixels among candidates (`nerf.contrast`), which the first batch waits for."""
+        return shares(self.scene.pixels) if self.candidates > 1 else None
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
         """Show only the pictures' centers at first; without this, runs on white backgrounds may never start learning.

@@ -91,16 +91,17 @@ def _built(
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
-    train_step = build_step(config, settings, scene, progress, start, model, loss)
-    if start is not None:
-        log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
-    loss = train_step.objective.loss
-    if loss.depth_every:
-        record["depths"] = depth_sums(scene)
-    train_step.new_optimizer()  # its errors occur before a folder is taken
+    loss = build(config.loss) if loss is None else loss
+    # Before kernels are compiled: its settings may be refused.
     data = build(config.data)(
         scene=scene, progress=progress, seed=config.seed, patch=loss.patch, depth_every=loss.depth_every
     )
+    train_step = build_step(config, settings, scene, progress, start, model, loss)
+    if start is not None:
+        log.info("init_from: starting from the weights of %s, step %d", start.path, start.step)
+    if loss.depth_every:
+        record["depths"] = depth_sums(scene)
+    train_step.new_optimizer()  # its errors occur before a folder is taken
     if ranks.is_first():
         build(config.quick_checks)(scene)
     return data, RadianceFieldSystem(train_step, record, config.resume_changed_capture)
