@@ -59,3 +59,10 @@ def concatenate(parts: Sequence[Struct]) -> Struct:
     first, *_ = parts
     tensors = iter([torch.cat(each) for each in zip(*(part.tensors() for part in parts), strict=True)])
     return first.map(lambda _: next(tensors))
+
+
+def overwrite(target: Tensor, numbers: Sequence[Any]) -> None:
+    """Write numbers of the host into a tensor; the host does not wait for a GPU."""
+    there = torch.tensor(numbers, dtype=target.dtype)
+    # Pinned anew each time: an earlier copy may not have begun.
+    target.copy_(there.pin_memory() if target.is_cuda else there, non_blocking=True)
