@@ -3,6 +3,7 @@
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -192,7 +193,7 @@ class LazyBatch:
     def now(self) -> Batch:
         """Return the batch."""
         there = torch.empty(len(self.numbers), dtype=torch.int64, device=self.device)
-        overwrite(there, self.numbers)
+        overwrite(there, np.array(self.numbers))
         return self.gather(there)
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "LazyBatch":

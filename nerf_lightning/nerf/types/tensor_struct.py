@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,8 +62,8 @@ def concatenate(parts: Sequence[Struct]) -> Struct:
     return first.map(lambda _: next(tensors))
 
 
-def overwrite(target: Tensor, numbers: Sequence[Any]) -> None:
-    """Write numbers of the host into a tensor; the host does not wait for a GPU."""
-    there = torch.tensor(numbers, dtype=target.dtype)
+def overwrite(target: Tensor, numbers: np.ndarray) -> None:
+    """Write numbers of the host, of the same type, into a tensor; the host does not wait for a GPU."""
+    there = torch.from_numpy(numbers)
     # Pinned anew each time: an earlier copy may not have begun.
     target.copy_(there.pin_memory() if target.is_cuda else there, non_blocking=True)

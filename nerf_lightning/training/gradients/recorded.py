@@ -14,6 +14,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -158,7 +159,7 @@ class RecordedGradients:
         kept = self.recordings[kind]
         if isinstance(batch, Batch) and kept.batch is not None:
             _copy(_inputs(kept.batch, kept.share), _inputs(batch, share))
-        overwrite(kept.numbers, (key, *numbers))
+        overwrite(kept.numbers, np.array((key, *numbers)))
         kept.replay()
         if kept.finish is not None and rest is not None:
             rest.add_up(kept.output)

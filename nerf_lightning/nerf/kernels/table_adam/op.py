@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -33,7 +34,7 @@ class AdamUpdate:
 
     def set_numbers(self, numbers: Sequence[tuple[float, float, float, float, float]]) -> None:
         """Set each parameter's step_size, root_scale, b1, b2 and eps."""
-        overwrite(self.numbers, numbers)
+        overwrite(self.numbers, np.array(numbers, np.float64 if self.numbers.dtype == torch.float64 else np.float32))
 
     def __call__(self) -> None:
         """Update the parameters in place."""
