@@ -92,7 +92,7 @@ class Report:
     scene_page: str = ""
     """The address of the page of the scene (`nerf export what=page`)."""
     scene_page_age: str = ""
-    """Which step the page shows, if not the last one."""
+    """Which step the page shows and which training has reached; empty: the same, or unknown."""
     exports: Pairs = field(default_factory=list)
     """Files for other programs: label and address."""
     result: str = ""

@@ -29,6 +29,7 @@ MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
 """Labels of the numbers that are not folded."""
 SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
+PAGE_AGE = "Exported at step {step:,}; training has reached step {last:,}."
 LONGEST_RESULT = 2000
 VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
@@ -115,12 +116,12 @@ def _add_exports(report: Report, exported: Path, folder: Path, step: int | None)
     page = exported / "page.html"
     if page.is_file() and is_scene_page(page):
         report.scene_page = address_from(page.absolute(), folder)
-        report.scene_page_age = _age(steps.get(page.name), step)
+        report.scene_page_age = _age(steps.get(page.name), step, PAGE_AGE)
 
 
-def _age(step: int | None, last: int | None) -> str:
+def _age(step: int | None, last: int | None, said: str = "step {step:,} of {last:,}") -> str:
     """Return what to say of a file that shows an earlier step than the last checkpoint; "" where either is unknown."""
-    return "" if step is None or last is None or step >= last else f"of step {step:,} of {last:,}"
+    return "" if step is None or last is None or step >= last else said.format(step=step, last=last)
 
 
 def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:

@@ -13,9 +13,13 @@ from nerf_lightning.runs.file_steps import record_steps
 
 
 @pytest.mark.parametrize(
-    ("shown", "last", "of"), [(200, 1270, "of step 200 of 1,270"), (270, 270, ""), (None, 270, ""), (200, None, "")]
+    ("shown", "last", "age"),
+    [
+        (200, 1270, "Exported at step 200; training has reached step 1,270."),
+        *((270, 270, ""), (None, 270, ""), (200, None, "")),
+    ],
 )
-def test_the_report_says_which_step_an_export_shows_if_that_is_known_and_not_the_last(tmp_path, shown, last, of):
+def test_the_report_says_which_step_an_export_shows_if_that_is_known_and_not_the_last(tmp_path, shown, last, age):
     files = [tmp_path / "export" / name for name in ("page.html", "points.ply")]
     files[0].parent.mkdir()
     for file, content in zip(files, (SCENE_PAGE, b""), strict=True):
@@ -24,8 +28,8 @@ def test_the_report_says_which_step_an_export_shows_if_that_is_known_and_not_the
         record_steps(files[0].parent, files, shown)
     report = Report("a run")
     _add_exports(report, tmp_path / "export", tmp_path, last)
-    assert (report.scene_page, report.scene_page_age) == ("./export/page.html", of)
-    assert report.exports == [(f"points.ply (0 MB{of and ', '}{of})", "./export/points.ply")]
+    assert (report.scene_page, report.scene_page_age) == ("./export/page.html", age)
+    assert report.exports == [(f"points.ply (0 MB{age and ', step 200 of 1,270'})", "./export/points.ply")]
 
 
 def test_the_report_links_the_page_from_wherever_it_lies(nerf, tmp_path):

@@ -52,10 +52,10 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     # The page was made from a copy: its command names the copy.
     assert f'<pre id="command">nerf train resume={path.parent / "run"} ' in text
     assert str(finished_run) not in text[: text.index("<h2")]
-    assert text.count("Depths have one scale") == 1
+    assert text.count("Depth, on one scale") == 1
     assert "</video>" in text
     assert read_steps(finished_run) == dict.fromkeys(("video.mp4", "depth.mp4", "progress.mp4"), 20)
-    assert "of step" not in text
+    assert " of 20)" not in text
     stamps = metrics["protocol"]["split_hash"], metrics["origin"]["checkpoint"], metrics["environment"]["torch"]
     for shown in (f"{metrics['psnr']:.2f} dB", *stamps, "trainer.max_steps=20", "near and far"):
         assert shown in text, shown

@@ -55,7 +55,7 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     report = (exported.parent / "report.html").read_text()
     assert 'href="./export/page.html">Open the 3D scene' in report
     assert 'href="./export/transforms.json">transforms.json (0.' in report
-    assert "of step" not in report
+    assert "Exported at" not in report
     assert "steps.json" not in report
     assert read_steps(exported) == {"page.html": 4, "transforms.json": 4, "sparse": 4}
     *_, last, longer, view = result.out.splitlines()
