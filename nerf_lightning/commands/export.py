@@ -19,6 +19,7 @@ from nerf_lightning.config.exporters import build_exporter
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
+from nerf_lightning.evaluation.main_numbers import main_numbers
 from nerf_lightning.export.base import Export, Neutral, RunContext
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say, say_written
@@ -27,7 +28,6 @@ from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
-from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.file_steps import record_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
@@ -112,7 +112,7 @@ def run_context(
     metrics = read_json_object(run / "metrics.json") | {"frames_per_second": None}
     known = [
         ("model", checkpoint.choices.get("model", "")),
-        *facts(metrics, read_note(run)),
+        *main_numbers(metrics, read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None

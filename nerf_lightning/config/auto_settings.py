@@ -110,7 +110,7 @@ def resolve_auto(requested: Composed, scene: Scene, device_type: str = "cpu") ->
     fitted = fit_model(requested, scene, device_type == "cuda", seconds)
     config = copy.deepcopy(fitted.config)
     _settle(config, "doctor", is_capture)
-    _settle(config.final, "report", is_capture)
+    _settle(config.final, "report", is_capture and "report" in option_names("final"))
     writes_page = is_capture and _writes_page(fitted, seconds)
     if writes_page:
         if config.budget.seconds == AUTO and resumed is None:

@@ -74,8 +74,8 @@ def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
     assert "search path" not in result.err
 
 
-@pytest.mark.parametrize(("command", "key"), [("render", "ckpt"), ("eval", "ckpt"), ("report", "run")])
-def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypatch, command, key):
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     said(nerf(command), f"nerf {command} needs a run, and outputs/ holds none")
     said(nerf(command, "paths.root_dir=elsewhere"), f"nerf {command} needs a run, and elsewhere/ holds none")
@@ -84,7 +84,7 @@ def test_without_a_run_the_newest_is_named_to_be_pasted(nerf, tmp_path, monkeypa
         (tmp_path / run / "checkpoints" / "last.ckpt").touch()
         os.utime(tmp_path / run / "checkpoints" / "last.ckpt", (1e9 - age, 1e9 - age))
     monkeypatch.chdir(tmp_path)
-    said(nerf(command), f"type: nerf {command} {key}=outputs/sweeps/new/0_seed=0")
+    said(nerf(command), f"type: nerf {command} ckpt=outputs/sweeps/new/0_seed=0")
 
 
 def test_settings_that_are_not_there_missing_or_of_the_wrong_kind_are_told(nerf):

@@ -49,7 +49,6 @@ def test_paths(tmp_path, monkeypatch):
     assert completed("eval", "ckpt=ru") == ["ckpt=run/"]
     assert completed("eval", "ckpt=run/") == ["ckpt=run/checkpoints/"]
     assert completed("train", "scene.root=no") == ["scene.root=notes"]
-    assert completed("report", "ru") == ["run/", "run="]
     assert completed("train", "trainer.val_every_steps=") == []
 
 

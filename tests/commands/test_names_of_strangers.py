@@ -6,7 +6,6 @@ import logging.config
 import os
 import re
 from dataclasses import replace
-from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import pytest
@@ -31,7 +30,6 @@ from nerf_lightning.evaluation.protocol import split_hash
 from nerf_lightning.export.cameras import CamerasExport, colmap_files
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.read_run import address_from
 from nerf_lightning.visualization.figures import new_figure, picture_of
 from nerf_lightning.visualization.pictures import with_caption
 
@@ -133,10 +131,3 @@ def test_drawings_show_names_as_text():
         with_caption(torch.zeros(4, 4, 3, dtype=torch.uint8), "a\nb", 10),
         with_caption(torch.zeros(4, 4, 3, dtype=torch.uint8), r"a\nb", 10),
     )
-
-
-def test_a_page_is_linked_whatever_its_run_is_called(tmp_path):
-    run = tmp_path / os.fsdecode(b"r\xff")
-    address = address_from(run / "export" / "page.html", tmp_path)
-    assert address == "./r%FF/export/page.html"
-    assert tmp_path / os.fsdecode(unquote_to_bytes(address)) == run / "export" / "page.html"

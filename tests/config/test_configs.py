@@ -196,7 +196,6 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
 @pytest.mark.parametrize(
     ("command", "override", "kind"),
     [
-        ("report", "max_megabytes=many", "a number"),
         ("doctor", "json=3", "true or false"),
         ("train", "seed=null", "a number"),
         ("poses", "max_image_size=true", "a number"),

@@ -35,6 +35,7 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
     },
     "evaluation": {"folder / f'{part}.png'"},
     "extensions": {
+        "folder / f'{part}.png'",
         "folder / f'table{ending}'",
         *("keyframes / 'depth' / f'{path.stem}.png'", "folder / 'pose' / f'{stem}.txt'"),
         *("folder / 'intrinsics' / f'{stem}.txt'", "picture.with_name(picture.name.replace('frame', 'depth'))"),
@@ -44,7 +45,6 @@ FREE = {  # Names of this program, numbers, digests; files that are read as they
         "path.with_name(f'.{path.stem}.{os.getpid()}_{MACHINE}.nerf_lightning.part{path.suffix}')",
         "folder / f'{name}.yaml'",
     },
-    "report": {"folder / f'{part}.png'"},
     "runs": {"make_folder(records_folder(sweep_folder)) / f'{self.number}.json'"},
     "video": {"folder / f'{stem}_{number:03d}{ending}'"},
     "training": {"folder / f'epoch_{epoch:04d}.png'", "folder / f'step_{step:07d}.png'"},

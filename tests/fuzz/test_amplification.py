@@ -27,7 +27,7 @@ from nerf_lightning.files.trust import reading
 from nerf_lightning.files.xml_files import read_xml
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.curves import read_curves
+from nerf_lightning.runs.curves import read_curves
 
 def read_npz(path):
     with open_npz(path, "") as arrays:

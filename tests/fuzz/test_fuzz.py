@@ -25,14 +25,13 @@ from support.scenes import ball_scene
 from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
-from nerf_lightning.commands import report
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.pixels.picture_files import image_size, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
-from nerf_lightning.report.curves import curve_drawings, read_curves
+from nerf_lightning.runs.curves import read_curves
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
 from nerf_lightning.video.paths.base import frame_of
@@ -81,9 +80,17 @@ def tabled(folder):
 
 
 def reported(folder):
+    from nerf_lightning.extensions.report.commands import report
+
     settings = (f"run={folder / 'runs' / 'a'}", f"paths.output_dir={folder / 'page'}", "doctor=false")
     report.run(composed("report", *settings))
     assert "<script>alert" not in (folder / "page" / "report.html").read_text()
+
+
+def charted(folder):
+    from nerf_lightning.extensions.report.charts import drawn
+
+    return drawn(read_curves(folder))
 
 
 def write_events(folder):
@@ -151,7 +158,6 @@ KINDS = {
     "keyframes": Kind(
         lambda f: (f / "keys.yaml").write_text(yaml.safe_dump({"keyframes": KEYFRAMES})), filmed, ("keys.yaml",)
     ),
-    "report": Kind(write_run, reported, (*OF_A_RUN, "runs/a/.hydra/config.yaml")),
     "resumed run": Kind(
         write_run, lambda f: tame(former_overrides(f / "runs" / "a", [])), ("runs/a/.hydra/overrides.yaml",)
     ),
@@ -160,9 +166,10 @@ KINDS = {
         lambda f: tame(former_sweep(f, [])),
         (sweep_record(Path()).as_posix(),),
     ),
-    "events": Kind(write_events, lambda f: curve_drawings(read_curves(f)), ("events.out.tfevents.1",), 15),
 }
 if find_spec("nerf_lightning.extensions"):
+    KINDS["report"] = Kind(write_run, reported, (*OF_A_RUN, "runs/a/.hydra/config.yaml"))
+    KINDS["events"] = Kind(write_events, charted, ("events.out.tfevents.1",), 15)
     KINDS["table"] = Kind(write_run, tabled, (*OF_A_RUN, "runs/a/.hydra/overrides.yaml"))
 
 

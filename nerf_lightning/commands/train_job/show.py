@@ -10,7 +10,7 @@ from statistics import fmean
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.profilers import SimpleProfiler
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
@@ -26,21 +26,19 @@ from nerf_lightning.config.open_checkpoint import LoadedModel, as_known
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.doctor.examine import advice
 from nerf_lightning.export.base import Export
+from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.made_folders import make_folder, remove_empty
+from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.curves import read_curves
-from nerf_lightning.report.page import write_report
-from nerf_lightning.report.read_run import read_run
+from nerf_lightning.runs.curves import read_curves
 from nerf_lightning.runs.file_steps import record_steps
-from nerf_lightning.runs.summary import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 
 ROWS = 15  # Of the profile: the slowest actions, including everything they called
 WIDTH = 54  # Characters of an action's name
 # The path of the film, in ten seconds.
 PATH = {"num_frames": 120, "fps": 12}
-MOST_VIDEO_BYTES = 20_000_000  # Of a film in the page that follows a training
 # Of photographs: with 16 of them, 92 steps reached 21.6 dB, and 1,018 steps 27.8.
 FEW_STEPS = 1_000
 RISING = 1.5  # dB of training PSNR in the second half of a run
@@ -66,14 +64,10 @@ def show(job: TrainJob, held: HeldFolder, trainer: Trainer, psnr: float | None) 
         log.info("profile: %s", profile)
     for name, what in job.post_training.exports.items():
         export_trained(name, what, job, folder)
-    if job.config.final.report:
-        checks, target = job.checks, folder / "report.html"
-        examine = None if checks is None else lambda: checks
-        report = read_run(
-            folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine, resume=to_type("resume", str(folder))
-        )
-        write_report(report, target)
-        say(f"result       {target}: {result}")
+    for name in option_names("final"):
+        if job.config.final.get(name):
+            write = build(DictConfig(read_plain_yaml(conf_file(f"final/{name}"))))
+            say(f"result       {write(folder, job.checks)}: {result}")
     if length:
         say(f"train longer {resume_command(folder)} {length}")
     say(f"look at it   {_program()} view {to_type('ckpt', str(folder))} {trust_setting(job)}".rstrip())

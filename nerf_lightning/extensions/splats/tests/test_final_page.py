@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from unittest.mock import create_autospec
 
 import pytest
-from support.measured_runs import leave_measured_run
 from support.running import FAST, refused, said
 from support.shiny_ball import all_around, record_of
 
@@ -18,9 +17,7 @@ from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.extensions.splats.page import PageExport
 from nerf_lightning.files.html import SCENE_PAGE
-from nerf_lightning.report.page import Report
-from nerf_lightning.report.read_run import _add_exports
-from nerf_lightning.runs.file_steps import read_steps, record_steps
+from nerf_lightning.runs.file_steps import read_steps
 from nerf_lightning.video.paths.auto import AutoPath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.orbit import Orbit
@@ -58,7 +55,7 @@ def test_the_page_is_made_in_the_run_and_the_report_links_it(train, tmp_path):
     report = (exported.parent / "report.html").read_text()
     assert 'href="./export/page.html">Open the 3D scene' in report
     assert 'href="./export/transforms.json">transforms.json (0.' in report
-    assert "of step" not in report
+    assert "Exported at" not in report
     assert "steps.json" not in report
     assert read_steps(exported) == {"page.html": 4, "transforms.json": 4, "sparse": 4}
     *_, last, longer, view = result.out.splitlines()
@@ -99,22 +96,6 @@ def test_longer_training_is_advised_before_more_photographs_while_it_helps(monke
     assert line.endswith(f"20.6 dB on held-out photographs, 16 of 17 photographs used. To improve it, {cure}")
 
 
-@pytest.mark.parametrize(
-    ("shown", "last", "of"), [(200, 1270, "of step 200 of 1,270"), (270, 270, ""), (None, 270, ""), (200, None, "")]
-)
-def test_the_report_says_which_step_an_export_shows_if_that_is_known_and_not_the_last(tmp_path, shown, last, of):
-    files = [tmp_path / "export" / name for name in ("page.html", "points.ply")]
-    files[0].parent.mkdir()
-    for file, content in zip(files, (SCENE_PAGE, b""), strict=True):
-        file.write_bytes(content)
-    if shown is not None:
-        record_steps(files[0].parent, files, shown)
-    report = Report("a run")
-    _add_exports(report, tmp_path / "export", tmp_path, last)
-    assert (report.scene_page, report.scene_page_age) == ("./export/page.html", of)
-    assert report.exports == [(f"points.ply (0 MB{of and ', '}{of})", "./export/points.ply")]
-
-
 def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
     def export(*_):
         raise OSError(28, "No space left on device")
@@ -141,19 +122,6 @@ def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):
 def test_what_cannot_be_exported_is_said_before_the_training(train, tmp_path, argument, parts):
     said(train(PageExport.export, argument), *parts)
     assert not (tmp_path / "run").exists()
-
-
-def test_the_report_links_the_page_from_wherever_it_lies(nerf, tmp_path):
-    run = leave_measured_run(tmp_path / 'a "run" <b>')
-    target = tmp_path / "elsewhere" / "report.html"
-    given = (run, "doctor=false", f"paths.output_dir={target.parent}")
-    (run / "export").mkdir()
-    (run / "export" / "page.html").write_text("<html>somebody's own</html>")
-    assert nerf("report", *given).code == 0
-    assert "page.html" not in target.read_text()
-    (run / "export" / "page.html").write_bytes(SCENE_PAGE)
-    assert nerf("report", *given).code == 0
-    assert 'href="./../a%20%22run%22%20%3Cb%3E/export/page.html"' in target.read_text()
 
 
 def record(folder, name, age, x):

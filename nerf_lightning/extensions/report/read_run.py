@@ -9,16 +9,18 @@ from urllib.parse import quote
 
 from nerf_lightning.checkpoints.reading import Checkpoint, newest_checkpoint
 from nerf_lightning.doctor.check import Check
+from nerf_lightning.evaluation.main_numbers import main_numbers
+from nerf_lightning.extensions.report.charts import drawn
+from nerf_lightning.extensions.report.coverage import coverage_map
+from nerf_lightning.extensions.report.metrics import depth_scale, per_image, tables, views_on_page
+from nerf_lightning.extensions.report.page import Report, embedded_file, embedded_video
 from nerf_lightning.files.html import is_scene_page
 from nerf_lightning.files.json_files import mapping, read_json_object
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.coverage import coverage_map
-from nerf_lightning.report.curves import curve_drawings, read_curves
-from nerf_lightning.report.metrics import depth_scale, facts, per_image, tables, views_on_page
-from nerf_lightning.report.page import Report, embedded_file, embedded_video
+from nerf_lightning.runs.curves import read_curves
 from nerf_lightning.runs.file_steps import STEPS, read_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
 
@@ -27,6 +29,7 @@ MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
 """Labels of the numbers that are not folded."""
 SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
+PAGE_AGE = "Exported at step {step:,}; training has reached step {last:,}."
 LONGEST_RESULT = 2000
 VIDEOS = {"video.mp4": "New views", "depth.mp4": "Depth", "progress.mp4": "Training progress"}
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
@@ -78,7 +81,7 @@ def read_run(
             _add_config(report, run)
         progress("curves", 0.0)
         with attempt("Curves"):
-            report.curves = curve_drawings(read_curves(run / "tensorboard"))
+            report.charts = drawn(read_curves(run / "tensorboard"))
         progress("films", 0.0)
         for name, label in VIDEOS.items():
             if (run / name).is_file():
@@ -113,12 +116,12 @@ def _add_exports(report: Report, exported: Path, folder: Path, step: int | None)
     page = exported / "page.html"
     if page.is_file() and is_scene_page(page):
         report.scene_page = address_from(page.absolute(), folder)
-        report.scene_page_age = _age(steps.get(page.name), step)
+        report.scene_page_age = _age(steps.get(page.name), step, PAGE_AGE)
 
 
-def _age(step: int | None, last: int | None) -> str:
+def _age(step: int | None, last: int | None, said: str = "step {step:,} of {last:,}") -> str:
     """Return what to say of a file that shows an earlier step than the last checkpoint; "" where either is unknown."""
-    return "" if step is None or last is None or step >= last else f"of step {step:,} of {last:,}"
+    return "" if step is None or last is None or step >= last else said.format(step=step, last=last)
 
 
 def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:
@@ -126,7 +129,7 @@ def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:
     report.subtitle = f"{run.absolute()}, started {str(note.get('started', 'at an unknown time')).replace('T', ' ')}"
     report.result = str(note.get("result", ""))[:LONGEST_RESULT]
     report.command = _resume_command(resume, str(note.get("resume_with", ""))[:LONGEST_RESULT])
-    known = facts(metrics, note)
+    known = main_numbers(metrics, note)
     report.facts = [pair for pair in known if pair[0] in MAIN]
     report.more_facts = [pair for pair in known if pair[0] not in MAIN]
     report.columns, report.per_image = per_image(metrics)

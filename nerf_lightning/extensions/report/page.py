@@ -14,11 +14,11 @@ from PIL import Image
 
 from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.doctor.check import Check
+from nerf_lightning.extensions.report.charts import Drawing
+from nerf_lightning.extensions.report.coverage import CoverageMap
 from nerf_lightning.files.html import data_address, json_in_page, write_page
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.coverage import CoverageMap
-from nerf_lightning.report.curves import Drawing
 from nerf_lightning.visualization.pictures import ERROR_SCALE
 
 LONGEST_SIDE = 1600
@@ -92,7 +92,7 @@ class Report:
     scene_page: str = ""
     """The address of the page of the scene (`nerf export what=page`)."""
     scene_page_age: str = ""
-    """Which step the page shows, if not the last one."""
+    """Which step the page shows and which training has reached; empty: the same, or unknown."""
     exports: Pairs = field(default_factory=list)
     """Files for other programs: label and address."""
     result: str = ""
@@ -111,7 +111,7 @@ class Report:
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
     """Pictures of one view during training."""
-    curves: list[Drawing] = field(default_factory=list)
+    charts: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
     """What the doctor found."""
@@ -128,6 +128,6 @@ class Report:
 
 def write_report(report: Report, target: Path) -> None:
     """Write the report as one file of HTML."""
-    charts = [chart._asdict() for chart in report.curves]
+    charts = [chart._asdict() for chart in report.charts]
     error_scale = f"{100 * ERROR_SCALE:g} %"
     write_page(FOLDER / "page.html", target, report=report, charts=json_in_page(charts), error_scale=error_scale)

@@ -10,11 +10,11 @@ from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
+from nerf_lightning.extensions.report.page import write_report
+from nerf_lightning.extensions.report.read_run import read_run
 from nerf_lightning.files.made_folders import require_no_way_out
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_one_of
-from nerf_lightning.report.page import write_report
-from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.summary import FILES
 

@@ -10,11 +10,14 @@ import shutil
 import pytest
 from support.browser import SIZES, layout_faults, opened
 from support.measured_runs import leave_measured_run
-from support.running import done, output_of, said, start
+from support.running import FAST, done, output_of, said, start
 from torch.utils.tensorboard import SummaryWriter
 
-from nerf_lightning.commands import report
-from nerf_lightning.report.read_run import _resume_command
+from nerf_lightning.config.help.candidates import candidates
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.extensions.report.after_training import write_after_training
+from nerf_lightning.extensions.report.commands import report
+from nerf_lightning.extensions.report.read_run import _resume_command
 from nerf_lightning.runs.file_steps import read_steps
 
 TERMS = [f"photo_distortion_{number}" for number in range(7)]  # A legend that needs several lines on phones
@@ -49,10 +52,10 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     # The page was made from a copy: its command names the copy.
     assert f'<pre id="command">nerf train resume={path.parent / "run"} ' in text
     assert str(finished_run) not in text[: text.index("<h2")]
-    assert text.count("Depths have one scale") == 1
+    assert text.count("Depth, on one scale") == 1
     assert "</video>" in text
     assert read_steps(finished_run) == dict.fromkeys(("video.mp4", "depth.mp4", "progress.mp4"), 20)
-    assert "of step" not in text
+    assert " of 20)" not in text
     stamps = metrics["protocol"]["split_hash"], metrics["origin"]["checkpoint"], metrics["environment"]["torch"]
     for shown in (f"{metrics['psnr']:.2f} dB", *stamps, "trainer.max_steps=20", "near and far"):
         assert shown in text, shown
@@ -111,6 +114,27 @@ def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
             assert layout_faults(driver, size) == layout_faults(driver, size, unfold) == []
 
 
+def test_training_ends_with_it(nerf, capture, tmp_path):
+    given = ("scene=npz", f"scene.path={capture}", *FAST, "final.video=false", f"paths.output_dir={tmp_path}")
+    result = done(nerf("train", *given, "final.report=true"))
+    assert f"result       {tmp_path}/report.html: " in result.out
+    assert {"curves", "capture", "config"} <= set(sections((tmp_path / "report.html").read_text()))
+
+
+def test_what_the_doctor_found_before_a_training_is_shown_after_it(tmp_path):
+    run = leave_measured_run(tmp_path / "run")
+    path = write_after_training(run, [Check("coverage", "look", "there is a gap", "Take 6 more photographs.")], 20)
+    assert path == run / "report.html"
+    assert "<p>there is a gap<br>" in path.read_text()
+    assert "there is a gap" not in write_after_training(run, None, 20).read_text()
+
+
+def test_a_folder_is_completed_without_a_key(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run" / ".hydra").mkdir(parents=True)
+    assert candidates(["report", "ru"], ["report"]) == ["run/", "run="]
+
+
 def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished_run, run)
@@ -148,9 +172,13 @@ def test_a_strangers_settings_do_nothing_else_in_a_shell(told):
     assert _resume_command("resume=run", "'") == _resume_command("resume=run", "") == ""
 
 
-def test_what_is_no_run_is_refused(nerf, tmp_path):
+def test_what_is_no_run_is_refused(nerf, tmp_path, monkeypatch):
+    newest = tmp_path / "outputs" / "bricks" / "old" / "checkpoints" / "last.ckpt"
+    newest.parent.mkdir(parents=True)
+    newest.touch()
     said(nerf("report", tmp_path), "is not a run folder")
-    said(nerf("report"), "nerf report needs a run")
+    monkeypatch.chdir(tmp_path)
+    said(nerf("report"), "nerf report needs a run", "type: nerf report run=outputs/bricks/old")
     said(nerf("report", tmp_path, tmp_path / "b"), "takes one folder")
     said(nerf("report", leave_measured_run(tmp_path / "run"), "measured=twice"), "measured=twice")
 

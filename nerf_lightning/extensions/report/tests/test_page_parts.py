@@ -9,10 +9,11 @@ import pytest
 from PIL import Image
 from support.shiny_ball import all_around, record_of
 
-from nerf_lightning.report.coverage import coverage_map
-from nerf_lightning.report.curves import MOST_CURVES, curve_drawings
-from nerf_lightning.report.metrics import WITHOUT_LPIPS, depth_scale, facts, per_image, tables, views_on_page
-from nerf_lightning.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
+from nerf_lightning.evaluation.main_numbers import main_numbers
+from nerf_lightning.extensions.report.charts import MOST_CURVES, drawn
+from nerf_lightning.extensions.report.coverage import coverage_map
+from nerf_lightning.extensions.report.metrics import WITHOUT_LPIPS, depth_scale, per_image, tables, views_on_page
+from nerf_lightning.extensions.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
 
 
 def decoded(picture):
@@ -45,20 +46,18 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
         "Training loss/$\\evil": (steps, [1.0, 1.0, 1.0]),
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
-    (psnr,) = curve_drawings(curves)  # of the losses, one point each can be drawn
+    (psnr,) = drawn(curves)  # of the losses, one point each can be drawn
     assert (psnr.label, psnr.note) == ("PSNR (dB)", "")
     assert [curve["label"] for curve in psnr.curves] == ["training", "validation"]
     assert psnr.curves[0]["values"] == [10.0, 20.0, 25.0]
-    two = curve_drawings(
-        {f"PSNR/train_{level}": (steps, [1.0, 2.0, end]) for level, end in (("coarse", 3.0), ("fine", 4.0))}
-    )
+    two = drawn({f"PSNR/train_{level}": (steps, [1.0, 2.0, end]) for level, end in (("coarse", 3.0), ("fine", 4.0))})
     assert [curve["label"] for curve in two[0].curves] == ["training (coarse)", "training (fine)"]
-    assert curve_drawings({}) == []
+    assert drawn({}) == []
 
 
 def test_equal_curves_are_drawn_once_under_both_names():
     losses = {"proposal": 1.0, "interlevel": 1.0, "fine": 2.0}
-    (drawing,) = curve_drawings({f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()})
+    (drawing,) = drawn({f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()})
     assert [curve["label"] for curve in drawing.curves] == ["fine", "interlevel = proposal"]
 
 
@@ -78,10 +77,10 @@ def test_the_coverage_map_has_a_dot_in_it_for_each_view_and_no_letters_in_its_pi
 
 def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
     curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0 + number]) for number in range(3000)}
-    (drawing,) = curve_drawings(curves)
+    (drawing,) = drawn(curves)
     assert len(drawing.curves) == MOST_CURVES
     assert drawing.note == "2988 more curves are in the run's TensorBoard files."
-    write_report(Report("a run", curves=[drawing]), tmp_path / "report.html")
+    write_report(Report("a run", charts=[drawing]), tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "<figcaption>2988 more curves are in the run&#x27;s TensorBoard files.</figcaption>" in text
 
@@ -100,9 +99,9 @@ def test_the_page_says_how_many_views_were_measured_and_what_lpips_needs_where_i
     assert ("LPIPS", WITHOUT_LPIPS) not in dict(tables(protocol | {"lpips": 0.1}))["Protocol"]
     assert dict(tables({}))["Protocol"] == []
     counts = {"num_images": 10, "split_views": 25}
-    assert ("views measured", "10 of 25") in facts(counts, {})
-    assert ("views measured", "25") in facts(counts | {"num_images": 25}, {})
-    assert "views measured" not in dict(facts({}, {}))
+    assert ("views measured", "10 of 25") in main_numbers(counts, {})
+    assert ("views measured", "25") in main_numbers(counts | {"num_images": 25}, {})
+    assert "views measured" not in dict(main_numbers({}, {}))
 
 
 def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():

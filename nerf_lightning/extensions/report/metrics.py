@@ -5,28 +5,13 @@ from typing import Any
 
 from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
+from nerf_lightning.evaluation.main_numbers import NAMES, in_units
 from nerf_lightning.evaluation.metrics_files import COLUMNS, as_text
+from nerf_lightning.extensions.report.page import Pairs, ViewOnPage, embedded
 from nerf_lightning.files.json_files import mapping, number
 from nerf_lightning.files.made_folders import child_of
-from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.report.page import Pairs, ViewOnPage, embedded
 
-FORMATS = {
-    "psnr": "{:.2f} dB",
-    "cc_psnr": "{:.2f} dB",
-    "ssim": "{:.4f}",
-    "lpips": "{:.4f}",
-    "depth_error": "{:.4f}",
-    "normal_error": "{:.1f}°",
-    "seconds": "{:.3f}",
-}
-NAMES = {"psnr": "PSNR", "cc_psnr": "PSNR with fitted colors", "ssim": "SSIM", "lpips": "LPIPS"}
-LABELS = {
-    **{metric: name for metric, name in NAMES.items() if metric != "psnr"},
-    "depth_error": "mean depth error (scene units)",
-    "normal_error": "mean error of surface normals",
-}
 ROWS = {
     ("protocol", "split"): "views",
     ("protocol", "split_hash"): "fingerprint of these views",
@@ -60,38 +45,11 @@ MOST_ROWS = 5000
 MOST_PAIRS = 60
 
 
-def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
-    """Return the numbers on top of a page."""
-    median, worst = mapping(metrics.get("median")), mapping(mapping(metrics.get("worst")).get("psnr"))
-    shown = [
-        ("PSNR (mean)", _formatted("psnr", metrics.get("psnr"))),
-        ("PSNR (median)", _formatted("psnr", median.get("psnr"))),
-        ("PSNR (worst view)", _formatted("psnr", worst.get("value"))),
-        *((label, _formatted(metric, metrics.get(metric))) for metric, label in LABELS.items()),
-    ]
-    count, of = number(metrics.get("num_images")), number(metrics.get("split_views"))
-    if count is not None and of is not None:
-        shown.append(("views measured", f"{count:,.0f}" if count == of else f"{count:,.0f} of {of:,.0f}"))
-    origin = mapping(metrics.get("origin"))
-    trained = number(note.get("training_seconds"))
-    shown.append(("training", "" if trained is None else spoken(trained)))
-    for label, value, form in (
-        ("rendering by the model", metrics.get("frames_per_second"), "{:.3g} frames per second"),
-        ("peak memory", metrics.get("peak_memory_gigabytes"), "{:.2f} GB"),
-        ("steps", note.get("finished_at_step"), "{:,.0f}"),
-        ("parameters", origin.get("parameters"), "{:,.0f}"),
-        ("size of the weights", origin.get("megabytes"), "{:.1f} MB"),
-    ):
-        known = number(value)
-        shown.append((label, "" if known is None else form.format(known)))
-    return [(label, text) for label, text in shown if text]
-
-
 def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Return the columns and the rows of the table of all views; columns that no view has are left out."""
     rows = [row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)][:MOST_ROWS]
     columns = [column for column in COLUMNS if any(row.get(column) is not None for row in rows)]
-    texts = [[str(row.get(c, ""))[:200] if c == "name" else _formatted(c, row.get(c)) for c in columns] for row in rows]
+    texts = [[str(row.get(c, ""))[:200] if c == "name" else in_units(c, row.get(c)) for c in columns] for row in rows]
     return [_name(column) for column in columns], texts
 
 
@@ -136,14 +94,9 @@ def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
     # The scales beside depth and error have letters too small for a page, which says what they say.
     width = pixels["truth"].shape[1]
     parts = {part: embedded(picture[:, :width]) for part, picture in pixels.items()}
-    known = {metric: _formatted(metric, row.get(metric)) for metric in ("psnr", "ssim")}
+    known = {metric: in_units(metric, row.get(metric)) for metric in ("psnr", "ssim")}
     numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)
-
-
-def _formatted(metric: str, value: Any) -> str:
-    known = number(value)
-    return "" if known is None else FORMATS[metric].format(known)
 
 
 def depth_scale(metrics: dict[str, Any]) -> str:
