@@ -29,7 +29,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-ci test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench fuzz clean
+.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench fuzz clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-20s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -65,9 +65,6 @@ test-slow: setup ## Run the tests that take minutes: browsers, killed runs, kern
 
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
-
-test-ci: setup ## Run make test and make test-slow in one go: workers start once, and none waits in between
-	@$(PYTEST) -m "not exhaustive"
 
 test-core: setup ## Try the options and commands in a copy of the project without extensions; every test must be collected there
 	@$(VENV)/bin/python -m pytest -m "" tests/test_without_extensions.py

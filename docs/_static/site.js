@@ -1,6 +1,7 @@
 /* Where long code may break, which tables do not fit into the page (site.css stacks their rows on phones), captions. */
 const LONG = {td: 24, "": 36}; // Shorter words of code (characters) stay whole, in tables and elsewhere: a line of a phone.
 const SHORT = 12; // Characters of cells that share a line where rows are stacked.
+const NUMBER = /^[-+~]?[\d.,]*\d( ?(%|[a-zA-Z/]{1,6}))?$/;
 const LABELED = 4; // Rows of fewer columns need no names of columns.
 const tables = [...document.querySelectorAll("table.docutils")];
 const columns = table => [...table.querySelectorAll("thead th")].map(cell => cell.textContent.trim());
@@ -27,6 +28,10 @@ for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
 }
 for (const table of tables) {
   const names = columns(table);
+  names.forEach((_, column) => {
+    const cells = [...table.rows].map(row => row.cells[column]), texts = cells.slice(1).map(cell => cell.textContent.trim()).filter(Boolean);
+    if (column && texts.length && texts.every(text => NUMBER.test(text))) cells.forEach(cell => cell.classList.add("number"));
+  });
   for (const row of table.querySelectorAll("tbody tr"))
     [...row.cells].forEach((cell, column) => {
       cell.classList.toggle("blank", !cell.textContent.trim() && !cell.querySelector("img"));

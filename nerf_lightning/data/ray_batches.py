@@ -24,7 +24,7 @@ from nerf_lightning.nerf.kernels.pixels.op import Domain, Order, has_kernel, ord
 from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.rays import Batch, PixelIndex
+from nerf_lightning.nerf.types.rays import Batch, LazyBatch, PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.nerf.types.tensor_struct import concatenate
 
@@ -182,11 +182,12 @@ class RayBatches:
         # ahead.
         return self.num_steps
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[Batch | LazyBatch]:
         device, progress = self.prefetch_for, self.progress
         if device is None:
             while True:
-                yield self.batch_at(progress.attempt, progress.rays_seen)
+                batch_at = self._in_one_kernel if self._has_kernel else self.batch_at
+                yield batch_at(progress.attempt, progress.rays_seen)
 
         def make(*position: int) -> Batch:
             batch = self.batch_at(*position)
@@ -198,8 +199,8 @@ class RayBatches:
     @torch_on_one_thread()
     def batch_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch after `rays_seen` rays of an attempt; `batch_rays` of None: the current batch size."""
-        if self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device):
-            return self._in_one_kernel(attempt, rays_seen, batch_rays)
+        if self._has_kernel:
+            return self._in_one_kernel(attempt, rays_seen, batch_rays).now()
         pixels, weight = self._drawn_at(attempt, rays_seen, batch_rays)
         batch = gather_batch(self.scene, pixels)
         if weight is not None:
@@ -208,15 +209,19 @@ class RayBatches:
             return batch
         return self.depths.with_depths(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
-    def _in_one_kernel(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Batch:
+    @property
+    def _has_kernel(self) -> bool:
+        return self.patch == 1 and self.views is None and has_kernel(self.whole.ends.device)
+
+    def _in_one_kernel(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> LazyBatch:
         domain, purpose, _, places = self._places_at(attempt, rays_seen, batch_rays)
         rays = Order(places, len(domain), fold(self.seed, attempt, purpose), self.candidates)
         numbered = Domain(domain.ends, domain.width, domain.views, domain.left, domain.top)
         if self.depths is None:
-            return ordered_batch(rays, numbered, self.scene.pixels, self.shares)
+            return ordered_batch(rays, numbered, self.scene.pixels, self.shares, kind=purpose)
         among, key = self._depth_places_at(rays_seen, batch_rays), fold(self.seed, attempt, "depths")
         of_known = Order(among, len(self.depths), key)
-        return ordered_batch(rays, numbered, self.scene.pixels, self.shares, self.depths.depths, of_known)
+        return ordered_batch(rays, numbered, self.scene.pixels, self.shares, self.depths.depths, of_known, purpose)
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return this process's pixels of that batch."""

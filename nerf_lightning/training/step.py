@@ -22,7 +22,7 @@ from nerf_lightning.nerf.part import StepContext, begin_step, buffers_to_average
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress, batch_size
-from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.rays import Batch, LazyBatch
 from nerf_lightning.training.gradients.recorded import RecordedGradients, Rest
 from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 from nerf_lightning.training.step_guard import StepGuard
@@ -80,7 +80,11 @@ class TrainStep:
                 part.sample_budget = -(-sample_budget // ranks.world_size())
 
     def __call__(
-        self, batch: Batch, optimizer: Any, backward: Backward = torch_backward, measure_gradients: bool = False
+        self,
+        batch: Batch | LazyBatch,
+        optimizer: Any,
+        backward: Backward = torch_backward,
+        measure_gradients: bool = False,
     ) -> StepOutput:
         """Take one step.
 
@@ -96,6 +100,8 @@ class TrainStep:
         objective, progress = self.objective, self.progress
         if self.num_steps is None:
             raise InputError("The length of the run is not known, which the learning rate follows: give num_steps=....")
+        if ranks.world_size() > 1:
+            batch = batch.now()  # whose weights are summed over the processes first
         with self.tiles.on_threads(self.device):
             optimizer.zero_grad()
             begin_step(objective, StepContext(progress.step / self.num_steps, progress.step, self.key))
@@ -105,6 +111,7 @@ class TrainStep:
             if self.gradients is not self.tiles:
                 taken, seen = True, self._replayed(self.gradients, batch, optimizer, backward, measure_gradients)
             else:
+                batch = batch.now()
                 seen = self.tiles(batch, self.key, self._share(batch), backward)
                 self._add_up(seen)
                 taken = self.guard.allows(seen.losses, objective.named_weights())
@@ -120,15 +127,15 @@ class TrainStep:
                 self._choose_batch()
             return seen
 
-    def _share(self, batch: Batch) -> Share | None:
+    def _share(self, batch: Batch | LazyBatch) -> Share | None:
         """Return this process's share of the batch; None: all of it."""
-        if ranks.world_size() == 1:
+        if isinstance(batch, LazyBatch) or ranks.world_size() == 1:
             return None
         first = ranks.share(self.progress.batch_rays // self.objective.pixels_per_patch).start
         return Share(first * self.objective.pixels_per_patch, self.progress.batch_rays, ranks.total(batch.weight.sum()))
 
     def _replayed(
-        self, gradients: Any, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool
+        self, gradients: Any, batch: Batch | LazyBatch, optimizer: Any, backward: Backward, measure_gradients: bool
     ) -> StepOutput:
         """Replay a step, with its update if the optimizer's can be recorded; the guard zeroes nonfinite gradients."""
         inner = getattr(optimizer, "optimizer", optimizer)  # Lightning's wrapper counts the steps
@@ -144,7 +151,7 @@ class TrainStep:
 
         def compute() -> None:
             update = None if recorded is None else recorded.next_update
-            changes = [*self.guard.tensors(batch.weight.device), *(() if update is None else update.tensors())]
+            changes = [*self.guard.tensors(batch.device), *(() if update is None else update.tensors())]
             rest = Rest(self._add_up, finish, changes, kind=(measure_gradients, update))
             outputs.append(gradients(batch, self.key, self._share(batch), backward, rest))
             if recorded is not None:

@@ -48,8 +48,8 @@ class StepGuard:
         # Large tables are skipped: their gradients have passed through the MLPs, whose gradients show it, too.
         watched = {name: gradient for name, gradient in gradients.items() if gradient.numel() < LARGE}
         # Few operations, each of which is a launch on a GPU.
-        sums = torch._foreach_norm([*watched.values(), losses], ord=1)
-        finite, first_bad = (torch.stack(sums) < math.inf).int().min(dim=0)
+        sums = torch.stack(torch._foreach_norm([*watched.values(), losses], ord=1))
+        finite, first_bad = torch.lt(sums, math.inf, out=sums.new_empty(len(sums), dtype=torch.int32)).min(dim=0)
         counts, former = self.tensors(finite.device)
         bad = 1 - finite
         counts[1:].mul_(bad)

@@ -36,7 +36,7 @@ def film(
     """Write the films (`video.mp4`, `depth.mp4`, or folders of frames of these names) and return their paths.
 
     An interrupted film continues with its missing frames. Depth is along the ray, in meters if the capture's unit is
-    known and else in its own, colored over the range of what is seen on the whole path, with its scale next to it.
+    known and else in its own, colored over the range of what is seen on the whole path, with its scale in a corner.
     Several models of one capture are shown side by side. Without settings, color and depth are filmed as videos.
 
     Raises:

@@ -31,21 +31,21 @@ def panel(
     depth_range: tuple[float, float],
     unit: float,
     normals: Float[Tensor, "height width 3"] | None,
-) -> UInt8[Tensor, "height wider 3"]:
-    """Return one output of a view (a key of `FILMS`, or a channel) as a picture.
+) -> UInt8[Tensor, "height width 3"]:
+    """Return one output of a view (a key of `FILMS`, or a channel) as a picture; scales are inside it.
 
     `levels` is the absolute difference of the first level that makes pictures and the last; `normals` are the
     surface's, as colors: 0.5 + 0.5 n along the axes of the capture's own frame. `depth_range` is near and far of the
     depth's colors, in meters or the user's units, of which `unit` make one of the scene's units.
     """
     if output == "depth":
-        return depth_picture(unit * picture.depth, *depth_range, picture.opacity)
+        return depth_picture(unit * picture.depth, *depth_range, picture.opacity, scale_inside=True)
     if output == "opacity":
         return to_bytes(picture.opacity[..., None].expand(-1, -1, 3))
     if output == "normals" and normals is not None:
         return to_bytes(faded(0.5 + 0.5 * normals, picture.opacity))
     if output == "levels" and picture.first_rgb is not None:
-        return error_picture(picture.first_rgb, picture.rgb)
+        return error_picture(picture.first_rgb, picture.rgb, scale_inside=True)
     return to_bytes(picture.rgb) if output in FILMS else channel_picture(output, picture)
 
 

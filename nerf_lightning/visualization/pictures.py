@@ -110,8 +110,9 @@ def depth_picture(
     near: float,
     far: float,
     opacity: Float[Tensor, "height width"] | None = None,
+    scale_inside: bool = False,
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return depth in colors, near bright, with its scale on the right.
+    """Return depth in colors, near bright, with its scale on the right or in the lower right corner.
 
     If `opacity` is given, colors fade to pale gray where light passes through.
     """
@@ -119,7 +120,7 @@ def depth_picture(
     for rows in row_chunks(*depth.shape):
         colors = color_map(depth[rows], low=far, high=near)
         picture[rows] = to_bytes(colors if opacity is None else faded(colors, opacity[rows]))
-    return _with_scale(picture, top=f"near {near:.3g}", bottom=f"far {far:.3g}")
+    return _with_scale(picture, f"near {near:.3g}", f"far {far:.3g}", scale_inside)
 
 
 def faded(
@@ -131,14 +132,14 @@ def faded(
 
 
 def error_picture(
-    truth: Float[Tensor, "height width 3"], render: Float[Tensor, "height width 3"]
+    truth: Float[Tensor, "height width 3"], render: Float[Tensor, "height width 3"], scale_inside: bool = False
 ) -> UInt8[Tensor, "height wider 3"]:
     """Return the absolute error (mean of the channels) in colors, 0 to `ERROR_SCALE`, with its scale."""
     picture = torch.empty(truth.shape, dtype=torch.uint8)
     for rows in row_chunks(*truth.shape[:2]):
         error = (truth[rows].detach().float().cpu() - render[rows].detach().float().cpu()).abs().mean(dim=-1)
         picture[rows] = to_bytes(color_map(error, 0.0, ERROR_SCALE))
-    return _with_scale(picture, top=f"{ERROR_SCALE:.3g}", bottom="0")
+    return _with_scale(picture, f"{ERROR_SCALE:.3g}", "0", scale_inside)
 
 
 def panels(
@@ -209,10 +210,24 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
     return torch.from_numpy(np.array(page))
 
 
-def _with_scale(picture: UInt8[Tensor, "height width 3"], top: str, bottom: str) -> UInt8[Tensor, "height wider 3"]:
-    """Add a slim color bar on the picture's right, from bright at `top` down to dark, with both texts."""
-    height = picture.shape[0]
-    size = letter_size(height)
+def _with_scale(
+    picture: UInt8[Tensor, "height width 3"], top: str, bottom: str, inside: bool
+) -> UInt8[Tensor, "height wider 3"]:
+    """Add a slim color bar, from bright at `top` down to dark, with both texts: on the right, or inside.
+
+    Inside, it covers a corner and keeps the size; a picture too small for that has none.
+    """
+    size = letter_size(picture.shape[0])
+    if not inside:
+        return torch.cat([picture, _scale(picture.shape[0], size, top, bottom)], dim=1)
+    margin = (0, 0, 0, 0, size // 3, size // 3)
+    scale = torch.nn.functional.pad(_scale(4 * size, size, top, bottom), margin, value=PAPER)
+    if scale.shape[0] <= picture.shape[0] // 2 and scale.shape[1] <= picture.shape[1] // 2:
+        picture[-scale.shape[0] :, -scale.shape[1] :] = scale
+    return picture
+
+
+def _scale(height: int, size: int, top: str, bottom: str) -> UInt8[Tensor, "height width 3"]:
     font = ImageFont.load_default(size)
     thick, space = max(4, size // 2), max(3, size // 3)
     longest = max(round(font.getlength(text) + 0.5) for text in (top, bottom))
@@ -223,4 +238,4 @@ def _with_scale(picture: UInt8[Tensor, "height width 3"], top: str, bottom: str)
     # Round digits reach beyond their lines.
     draw.text((left, 1), top, fill=_INK, font=font, anchor="lt")
     draw.text((left, height - 2), bottom, fill=_INK, font=font, anchor="ls")
-    return torch.cat([picture, torch.from_numpy(np.array(page))], dim=1)
+    return torch.from_numpy(np.array(page))

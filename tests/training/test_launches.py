@@ -14,11 +14,11 @@ pytest.importorskip("triton", reason="triton is not installed (Linux only)")
 
 BUDGETS = {
     # On the device (operations and kernels): a step, one that is replayed beside its replay, a rendered tile. On the
-    # host: a step.
-    "fast,bf16-mixed": (80, 5, 33, 3),
-    "fast_proposal,bf16-mixed": (116, 5, 26, 3),
-    "nerf_tiny,bf16-mixed": (246, 6, 110, 4),
-    "fast,32-true": (97, 5, 40, 3),
+    # host: a step; two of these pin the numbers of its batch and those of Adam.
+    "fast,bf16-mixed": (80, 3, 33, 4),
+    "fast_proposal,bf16-mixed": (116, 3, 26, 4),
+    "nerf_tiny,bf16-mixed": (246, 4, 110, 5),
+    "fast,32-true": (97, 3, 40, 4),
 }
 # How far losses may be apart after up to two steps: bfloat16 has 8 bits, and Adam's first steps follow signs.
 TOLERANCE = {"bf16-mixed": 1e-2, "32-true": 1e-4}
@@ -41,7 +41,7 @@ def test_kernels_learn_what_torch_does_with_no_more_launches_than_before(case):
     assert found["forgotten"] == []  # what a recording (CUDA graph) reads is written to, and never replaced
     assert found["losses"] == pytest.approx(found["without"], rel=TOLERANCE[precision])
     counted = (
-        *(found[each]["operations"] + found[each]["kernels"] for each in ("step", "replay", "tile")),
+        *(found[each].get("operations", 0) + found[each].get("kernels", 0) for each in ("step", "replay", "tile")),
         found["step"]["host"],
     )
     print(f'    "{case}": {counted},')  # pytest -rP shows the table anew

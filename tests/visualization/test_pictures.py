@@ -102,6 +102,18 @@ def test_the_depth_picture_keeps_the_pixels_left_of_its_scale(size):
     assert bar[-1] < 10
 
 
+def test_a_scale_inside_a_picture_keeps_its_size_and_leaves_out_what_has_no_room():
+    depth = torch.linspace(2, 6, 301).expand(301, 301)
+    plain, scaled = to_bytes(color_map(depth, 6.0, 2.0)), depth_picture(depth, 2.0, 6.0, scale_inside=True)
+    changed = (plain != scaled).any(dim=-1)
+    assert scaled.shape == plain.shape
+    assert changed.any()
+    assert not changed[:-60].any()
+    assert not changed[:, :200].any()
+    small = depth[:20, :30]
+    assert torch.equal(depth_picture(small, 2.0, 6.0, scale_inside=True), to_bytes(color_map(small, 6.0, 2.0)))
+
+
 def test_depth_fades_to_grey_where_nothing_is_and_error_has_a_fixed_scale():
     opacity = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
     picture = depth_picture(torch.full((2, 2), 6.0), 2.0, 6.0, opacity)

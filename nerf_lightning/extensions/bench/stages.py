@@ -51,7 +51,7 @@ class LoadedSteps:
         waited = 0.0
         for _ in range(self.steps):
             waited += seconds_of(self._load)
-            self.train_on(self.batch)
+            self.train_on(self.batch.now())
             self.batches.progress.advance(self.batches.progress.batch_rays)
         self.waits.append(waited / self.steps)
 

@@ -40,7 +40,7 @@ class Page:
         most_height: height of the finest image, in pixels.
         training: controls for the training that the page shows; None: no training.
         exports: folder of files that users can download; None: none.
-        run: the run's folder, whose name stands above the panel with the scene's; None: the scene's alone.
+        run: the run's folder, which may name the scene; None: the capture's own name is the title.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Page:
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages may be closed while a picture is being sent; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        title = record.name if run is None else _title(record.name, run)
+        title = record.name if run is None else scene_of_run(record.name, run)
         self.server = guarded_server(auth, free_port(auth.host, port), title)
         self.server.gui.set_panel_label(title)
         self._dress(record)
@@ -114,8 +114,3 @@ class Page:
         shape = 1.0 if panorama else int(cameras.width[self.first]) / int(cameras.height[self.first])
         widest = math.radians(MOST_DEGREES)
         return min(fov_that_holds(vertical_field_of_view(cameras, self.first), shape, window), widest)
-
-
-def _title(name: str, run: Path) -> str:
-    scene = scene_of_run(name, run)
-    return scene if scene == run.name else f"{scene}, {run.name}"

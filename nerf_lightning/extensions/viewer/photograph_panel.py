@@ -26,9 +26,7 @@ class PhotographPanel:
             visible = gui.add_checkbox("Show cameras", False, hint="These can be clicked, too")
             self.choice = gui.add_dropdown("Photograph", (NONE, *labels), initial_value=NONE)
             self.name = gui.add_markdown("", visible=False)
-            self.split = gui.add_slider(
-                "Photograph | Render", 0.0, 1.0, 0.01, session.split, visible=False, hint="Left is the photograph"
-            )
+            self.split = gui.add_slider("Photograph | Render", 0.0, 1.0, 0.01, session.split, visible=False)
             self.leave = gui.add_button("Leave photograph", visible=False)
         visible.on_update(harmless(lambda _: self.frusta.show(visible.value)))
         self.choice.on_update(harmless(self._choose))

@@ -1,14 +1,16 @@
 """Rays, where they are sampled, the points at which fields are evaluated, and the pixels that rays belong to."""
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.nerf.randomness import PointRandom
-from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct, overwrite
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,37 @@ class Batch(TensorStruct):
     def num_rays(self) -> int:
         """Number of pixels, each with its ray."""
         return self.weight.numel()
+
+    def now(self) -> "Batch":
+        """Return the same: unlike a `LazyBatch`, it has been gathered."""
+        return self
+
+
+@dataclass(frozen=True)
+class LazyBatch:
+    """A batch that is gathered on its device when a step asks for it.
+
+    A recorded step gathers it from numbers that it reads on the device, and so its replay the batch of other numbers.
+    """
+
+    num_rays: int
+    numbers: tuple[int, ...]
+    """What varies between batches."""
+    kind: Hashable
+    """The same for batches that differ in their numbers alone."""
+    gather: Callable[[Int[Tensor, "numbers"]], Batch]
+    """Returns the batch of numbers that lie on the device."""
+    device: torch.device
+
+    def now(self) -> Batch:
+        """Return the batch."""
+        there = torch.empty(len(self.numbers), dtype=torch.int64, device=self.device)
+        overwrite(there, np.array(self.numbers))
+        return self.gather(there)
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "LazyBatch":
+        """Return the same: it is where the pixels are, which is where the model is."""
+        return self
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -59,3 +60,10 @@ def concatenate(parts: Sequence[Struct]) -> Struct:
     first, *_ = parts
     tensors = iter([torch.cat(each) for each in zip(*(part.tensors() for part in parts), strict=True)])
     return first.map(lambda _: next(tensors))
+
+
+def overwrite(target: Tensor, numbers: np.ndarray) -> None:
+    """Write numbers of the host, of the same type, into a tensor; the host does not wait for a GPU."""
+    there = torch.from_numpy(numbers)
+    # Pinned anew each time: an earlier copy may not have begun.
+    target.copy_(there.pin_memory() if target.is_cuda else there, non_blocking=True)

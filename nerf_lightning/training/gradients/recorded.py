@@ -14,6 +14,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +23,8 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.tiles import is_out_of_memory
 from nerf_lightning.nerf.objective import Objective, StepOutput
 from nerf_lightning.nerf.part import parts_of, sample_counts
-from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.rays import Batch, LazyBatch
+from nerf_lightning.nerf.types.tensor_struct import overwrite
 from nerf_lightning.training.gradients.tiles import Backward, Share, TileGradients, torch_backward
 
 KNOWN = (__name__.partition(".")[0], "torch")
@@ -81,9 +83,11 @@ class Rest:
 class _Recording:
     """A recording for one batch size."""
 
-    batch: Batch
+    batch: Batch | None
+    """What later batches are copied to; None: `replay` gathers them by their numbers."""
     share: Share | None
-    key: Tensor
+    numbers: Tensor
+    """The key of the step's random numbers, and those of a lazy batch."""
     replay: Callable[[], None]
     output: StepOutput
     finish: Callable[[], None] | None
@@ -117,7 +121,7 @@ class RecordedGradients:
 
     def __call__(
         self,
-        batch: Batch,
+        batch: Batch | LazyBatch,
         key: int,
         share: Share | None = None,
         backward: Backward = torch_backward,
@@ -139,21 +143,23 @@ class RecordedGradients:
             self.replays = False
             self.recordings.clear()
             self.tiles.objective.zero_grad(set_to_none=False)
-        seen = self.tiles(batch, key, share, backward)
+        seen = self.tiles(batch.now(), key, share, backward)
         if rest is None:
             return seen
         rest.add_up(seen)
         return rest.finish(seen)
 
-    def _replayed(self, batch: Batch, key: int, share: Share | None, rest: Rest | None) -> StepOutput:
+    def _replayed(self, batch: Batch | LazyBatch, key: int, share: Share | None, rest: Rest | None) -> StepOutput:
         of_share = None if share is None else (share.first, share.num_rays)
-        variants = of_share, None if rest is None else rest.kind, *(part.step_variant for part in self.parts)
-        kind = batch.num_rays, variants
+        of_batch, numbers = (batch.kind, batch.numbers) if isinstance(batch, LazyBatch) else (None, ())
+        of_rest = None if rest is None else rest.kind
+        kind = batch.num_rays, (of_batch, of_share, of_rest, *(part.step_variant for part in self.parts))
         if kind not in self.recordings:
-            self.recordings[kind] = self._recorded(batch, key, share, rest)
+            self.recordings[kind] = self._recorded(batch, (key, *numbers), share, rest)
         kept = self.recordings[kind]
-        _copy(_inputs(kept.batch, kept.share), _inputs(batch, share))
-        kept.key.fill_(key)
+        if isinstance(batch, Batch) and kept.batch is not None:
+            _copy(_inputs(kept.batch, kept.share), _inputs(batch, share))
+        overwrite(kept.numbers, np.array((key, *numbers)))
         kept.replay()
         if kept.finish is not None and rest is not None:
             rest.add_up(kept.output)
@@ -162,10 +168,12 @@ class RecordedGradients:
             parameter.grad = gradient
         return kept.output
 
-    def _recorded(self, batch: Batch, key: int, share: Share | None, rest: Rest | None) -> _Recording:
-        batch = batch.map(lambda each: each.clone(memory_format=torch.contiguous_format))
+    def _recorded(
+        self, batch: Batch | LazyBatch, numbers: tuple[int, ...], share: Share | None, rest: Rest | None
+    ) -> _Recording:
+        of_step = torch.tensor(numbers, device=batch.device)
+        kept = None if isinstance(batch, LazyBatch) else batch.map(_copied)
         share = None if share is None else replace(share, weight=share.weight.clone())
-        kept_key = torch.full((), key, device=batch.weight.device)
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -176,8 +184,10 @@ class RecordedGradients:
 
         def work() -> StepOutput:
             self._zero_gradients()
-            whole = Share.whole(batch) if share is None else share
-            seen = self.tiles.in_tiles_of(batch.num_rays, batch, whole, kept_key)
+            pixels = batch.gather(of_step[1:]) if isinstance(batch, LazyBatch) else kept
+            assert pixels is not None
+            whole = Share.whole(pixels) if share is None else share
+            seen = self.tiles.in_tiles_of(pixels.num_rays, pixels, whole, of_step[0])
             return rest.finish(seen) if rest is not None and together else seen
 
         finish = None
@@ -190,13 +200,17 @@ class RecordedGradients:
             for each, former in zip(changed, before, strict=True):
                 each.copy_(former)
         self._zero_gradients(all_of_them=True)
-        return _Recording(batch, share, kept_key, replay, seen, finish, [each.grad for each in self.parameters])
+        return _Recording(kept, share, of_step, replay, seen, finish, [each.grad for each in self.parameters])
 
     def _zero_gradients(self, all_of_them: bool = False) -> None:
         for parameter in self.parameters:
             # Others are zero already: the optimizer leaves them so (`optimizers.table_adam`).
             if parameter.grad is not None and (all_of_them or not getattr(parameter, "grad_in_place", False)):
                 parameter.grad.zero_()
+
+
+def _copied(tensor: Tensor) -> Tensor:
+    return tensor.clone(memory_format=torch.contiguous_format)
 
 
 def _inputs(batch: Batch, share: Share | None) -> list[Tensor]:

@@ -76,7 +76,7 @@ class Marks {
     } else {
       this.begin(null);
       this.add("distances", { from: this.first, to: point });
-      const said = this.metres === null ? " in the capture's own units, whose length is not known" : "";
+      const said = this.metres === null ? " scene units (no scale known)" : "";
       byId("told").textContent = this.told(this.lists.distances.at(-1)) + said;
       clearTimeout(this.passing);
       this.passing = setTimeout(() => this.forget(), TOLD);
@@ -177,7 +177,6 @@ function asked(question, value) {
   const [dialog, name] = ["naming", "name"].map(byId);
   byId("asked").textContent = question;
   name.value = value;
-  byId("cancel").onclick = () => dialog.close();
   dialog.showModal();
   name.select();
   return new Promise((found) => {

@@ -371,6 +371,7 @@ function listenToControls(frames) {
     if (!event.target.matches("#turn, #play") && ![" ", "t", "T"].includes(event.key)) frames.stop();
   }, { capture: true, passive: true });
   byId("about-run").addEventListener("click", () => byId("numbers").showModal());
+  for (const button of document.querySelectorAll("dialog .close")) button.addEventListener("click", () => button.parentElement.close());
   const background = byId("background");
   const behind = () => [1, 3, 5].map((start) => parseInt(background.value.slice(start, start + 2), 16) / 255);
   background.addEventListener("input", () => {

@@ -118,6 +118,23 @@ def test_labels_at_one_point_do_not_overlap_and_same_texts_are_numbered(page):
         assert sum(not leader.endswith(" v 0") for leader in leaders) >= 2  # to labels that had to give way
 
 
+@pytest.mark.parametrize(("key", "dialog"), [("i", "numbers"), ("v", "naming")])
+def test_each_dialog_closes_by_its_button_and_by_escape(page, key, dialog):
+    with opened(page.as_uri(), 500, 400) as driver:
+        wait_for(driver, "still")
+        views = len(driver.find_elements("css selector", "#views button"))
+        for leave in (lambda: driver.find_element("css selector", f"#{dialog} .close").click(), escape(driver)):
+            press(driver, key)
+            assert driver.find_element("id", dialog).is_displayed()
+            leave()
+            assert not driver.find_element("id", dialog).is_displayed()
+        assert len(driver.find_elements("css selector", "#views button")) == views
+
+
+def escape(driver):
+    return lambda: driver.switch_to.active_element.send_keys("\ue00c")
+
+
 def test_it_turns_by_itself_until_it_is_touched(page):
     with opened("about:blank", 300, 300) as driver:
         driver.execute_cdp_cmd("Emulation.setEmulatedMedia", MOTION)

@@ -1,6 +1,6 @@
 """Batches of pixels for CUDA in one kernel: which pixels, in keyed order, and their content.
 
-It is `RayBatches.at` for single pixels, bit for bit. `TRITON_INTERPRET=1` runs it without a GPU.
+It is `RayBatches.batch_at` for single pixels, bit for bit. `TRITON_INTERPRET=1` runs it without a GPU.
 """
 
 from typing import no_type_check
@@ -8,12 +8,12 @@ from typing import no_type_check
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.pixels.op import NOWHERE, Domain, Order
+from nerf_lightning.nerf.kernels.pixels.op import Domain
 from nerf_lightning.nerf.kernels.random.cuda import mix
-from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, fold, grid_of
+from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
 from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
 
@@ -22,29 +22,29 @@ BLOCK = 64
 
 
 def batch(
-    rays: Order,
+    count: int,
+    size: int,
+    known_size: int,
+    candidates: int,
     domain: Domain,
     store: PixelStore,
-    shares: UInt8[Tensor, "pixels"] | None = None,
-    depths: KnownDepths | None = None,
-    of_known: Order = NOWHERE,
+    shares: UInt8[Tensor, "pixels"] | None,
+    depths: KnownDepths | None,
+    numbers: Int[Tensor, "6"],
 ) -> Batch:
-    """Return the batch (`op.ordered_batch`)."""
-    device, several = store.rgba.device, len(rays.places)
-    count = several + len(of_known.places)
+    """Return the batch (`op.ordered_batch`) of numbers on the device, in the order in which the kernel loads them."""
+    device = store.rgba.device
     view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
     rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
     distance, certainty = (None, None) if depths is None else (torch.empty_like(weight), torch.empty_like(weight))
     if count:
         _batch[(triton.cdiv(count, BLOCK),)](
             *(view, x, y, rgba, weight, distance, certainty),
-            *(several, rays.places.start, rays.size, rays.key, *grid_of(rays.size)),
-            fold(rays.key, "contrast"),
-            *(count, of_known.places.start, of_known.size, of_known.key, *grid_of(of_known.size)),
+            *(numbers, count, size, *grid_of(size), known_size, *grid_of(known_size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
             *(store.offset, store.width, store.rgba, store.mask, shares),
             *([None] * 5 if depths is None else depths.tensors()),
-            *(rays.candidates, FEISTEL_ROUNDS),
+            *(candidates, FEISTEL_ROUNDS),
             BLOCK,
         )
     return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
@@ -60,15 +60,12 @@ def trial(device: str = "cuda") -> None:
     domain, rgba = Domain(ends, 0 * views + 2, views, 0 * views, 0 * views), torch.arange(32, device=device)
     store = PixelStore(rgba.view(8, 4).to(torch.uint8), ends - 4, 0 * views + 2, 0 * views + 2, has_transparency=True)
     depths = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
-    found = batch(Order(range(8), 8, 1), domain, store, None, depths, Order(range(2), 2, 1))
+    numbers = torch.tensor([8, 0, 1, 0, 0, 1], device=device)
+    found = batch(10, 8, 2, 1, domain, store, None, depths, numbers)
     number = 4 * found.pixels.view + 2 * found.pixels.y + found.pixels.x
     right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
     if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):
         raise RuntimeError("a trial of its kernels gave wrong pixels")
-
-
-VARIES = ["several", "first", "key", "chooser", "count", "known_first", "known_key"]
-"""Arguments that vary between steps, without recompiling."""
 
 
 @triton.jit
@@ -110,18 +107,19 @@ def _pixel(number, ends, across, views, left, top, slots, steps, valid, block: t
     return tl.load(views + low, mask=valid, other=0), x, within // side + tl.load(top + low, mask=valid, other=0)
 
 
-@triton.jit(do_not_specialize=VARIES)
+@triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _batch(
     out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
-    several, first, size, key, rows, columns, chooser,
-    count, known_first, known_size, known_key, known_rows, known_columns,
+    numbers, count, size, rows, columns, known_size, known_rows, known_columns,
     ends, across, views, left, top, slots, steps,
     offset, width, rgba, mask, shares,
     known_view, known_x, known_y, known_distance, known_certainty,
     candidates: tl.constexpr, rounds: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     index = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
+    several, first, key = tl.load(numbers), tl.load(numbers + 1), tl.load(numbers + 2)
+    chooser, known_first, known_key = tl.load(numbers + 3), tl.load(numbers + 4), tl.load(numbers + 5)
     valid, is_known = index < count, index >= several
     # Rays have `candidates` places each, rays through pixels of known distance one.
     size = tl.where(is_known, known_size, size).to(tl.int64)

@@ -1,5 +1,7 @@
-"""Batches of pixels in one kernel, if there is one; the reference is `data.ray_batches.RayBatches.at`."""
+"""Batches of pixels in one kernel, if there is one; the reference is in `data.ray_batches.RayBatches.batch_at`."""
 
+from collections.abc import Hashable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -7,7 +9,8 @@ from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cuda_backend
-from nerf_lightning.nerf.types.rays import Batch, KnownDepths
+from nerf_lightning.nerf.randomness import fold
+from nerf_lightning.nerf.types.rays import KnownDepths, LazyBatch
 from nerf_lightning.nerf.types.scene import PixelStore
 
 
@@ -53,7 +56,8 @@ def ordered_batch(
     shares: UInt8[Tensor, "pixels"] | None = None,
     depths: KnownDepths | None = None,
     of_known: Order = NOWHERE,
-) -> Batch:
+    kind: Hashable = None,
+) -> LazyBatch:
     """Return pixels at some places in the order of a domain, then some of those of known distance.
 
     Requires `has_kernel`.
@@ -65,7 +69,13 @@ def ordered_batch(
         shares: by which one of the candidates is chosen (`nerf.contrast.shares`); needed if there are several.
         depths: pixels whose distance is known; None: no distances are needed.
         of_known: places among them.
+        kind: the same for batches that differ in places and keys alone.
     """
     kernels = cuda_backend("pixels.cuda", domain.ends.device)
     assert kernels is not None, "has_kernel is asked first"
-    return kernels.batch(rays, domain, store, shares, depths, of_known)
+    count = len(rays.places) + len(of_known.places)
+    chooser = fold(rays.key, "contrast")
+    numbers = len(rays.places), rays.places.start, rays.key, chooser, of_known.places.start, of_known.key
+    sizes = rays.size, of_known.size, rays.candidates
+    gather = partial(kernels.batch, count, *sizes, domain, store, shares, depths)
+    return LazyBatch(count, numbers, kind, gather, domain.ends.device)

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
+from nerf_lightning.nerf.types.tensor_struct import overwrite
 
 Row = tuple[Tensor, Tensor, Tensor, Tensor]
 """A parameter, its gradient and its two moments."""
@@ -32,9 +34,7 @@ class AdamUpdate:
 
     def set_numbers(self, numbers: Sequence[tuple[float, float, float, float, float]]) -> None:
         """Set each parameter's step_size, root_scale, b1, b2 and eps."""
-        there = torch.tensor(numbers, dtype=self.numbers.dtype)
-        # Pinned anew each time: an earlier copy may not have begun.
-        self.numbers.copy_(there.pin_memory() if self.numbers.is_cuda else there, non_blocking=True)
+        overwrite(self.numbers, np.array(numbers, np.float64 if self.numbers.dtype == torch.float64 else np.float32))
 
     def __call__(self) -> None:
         """Update the parameters in place."""
