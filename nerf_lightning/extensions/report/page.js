@@ -21,6 +21,13 @@ for (const figure of document.querySelectorAll(".wipe")) {
   move();
 }
 
+// Films in one row are equally high.
+for (const film of document.querySelectorAll(".films video")) {
+  const fit = () => film.parentElement.style.setProperty("--aspect", film.videoWidth / film.videoHeight);
+  film.addEventListener("loadedmetadata", fit);
+  if (film.videoWidth) fit();
+}
+
 // Color and depth of the same film play in step.
 const [color, depth] = document.querySelectorAll(".paired video");
 if (depth) {
