@@ -13,7 +13,7 @@ from support.posed_captures import Known, read, write_colmap
 from support.running import refused
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import make_record, scene_record
+from nerf_lightning.checkpoints.record import make_record, scene_record
 from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.nerf.geometry.world_frame import similarity, told_length
 from nerf_lightning.video.paths.orbit import Orbit

@@ -18,6 +18,9 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
+LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+"""Names of the files in a run's checkpoints/."""
+DAMAGED = "damaged.ckpt"
 FORMAT = 7
 KEY = "nerf_lightning"
 PARTS = ("model.", "rays.", "correction.", "loss.")

@@ -1,35 +1,31 @@
-"""What a checkpoint holds besides weights and optimizer, how it is read, and which one of a run folder is read.
-
-A checkpoint consists of tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is
-executed. Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked
-from each config group), scene (cameras, bounds, splits, frame), refined (those cameras as learned, if they were),
-quantized (weights in fewer bytes, if it was made smaller), pixels (a hash of each photograph), and the run's state
-(`training/restore.py`).
-"""
+"""How a checkpoint is read, and which one of a run folder is read; what it holds is made in `record.py`."""
 
 import contextlib
 import logging
 import os
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
 
-from nerf_lightning import __version__
-from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, require_our_format, scene_of
+from nerf_lightning.checkpoints.format import (
+    BEST,
+    KEY,
+    LAST,
+    PREVIOUS,
+    require_checkpoint,
+    require_our_format,
+    scene_of,
+)
 from nerf_lightning.checkpoints.quantization import dequantized
-from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.regular import AbsentError
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.files.trust import Mismatch, reading, require_fit
+from nerf_lightning.files.trust import reading, require_fit
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import for_terminal
-from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
-LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
-DAMAGED = "damaged.ckpt"
 OTHER_MODEL = (
     "Use another one, or give the model, field and encoder settings that it was trained with (.hydra/overrides.yaml of "
     "that run)."
@@ -84,29 +80,6 @@ class Checkpoint:
                 where = f" ({first[0]})" if first else ""
                 raise InputError(f"{self.path} holds the {name} of another model{where}. {OTHER_MODEL}") from error
             require_fit(state, module.state_dict(), name)
-
-
-def scene_record(scene: Scene) -> SceneRecord:
-    """Return the part of a scene that outlives its pictures."""
-    return SceneRecord(**{field.name: getattr(scene, field.name) for field in fields(SceneRecord)})
-
-
-def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str, Any]:
-    """Return the part of a checkpoint that does not change during a run.
-
-    Raises:
-        InputError: no checkpoint could keep the scene, which is better reported before training than after.
-    """
-    record = scene_record(scene)
-    try:
-        check_scene(record, "The scene")
-    except Mismatch as error:
-        raise InputError(
-            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Fix the capture, or "
-            "the settings (scene.*, budgets.*)."
-        ) from error
-    kept = vars(record) | {"cameras": dict(vars(scene.cameras))}
-    return {"format": FORMAT, "version": __version__, "config": config, "choices": choices, "scene": kept}
 
 
 def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:

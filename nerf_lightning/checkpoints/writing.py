@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
+from nerf_lightning.checkpoints.format import LAST, PREVIOUS
 from nerf_lightning.files.atomic import FULL, persistently, whole_file
 from nerf_lightning.messages.errors import InputError
 

@@ -160,7 +160,8 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first, require_settings
         from nerf_lightning.cli.process import compose_once
-        from nerf_lightning.config.hydra_versions import hydra_main, search_extensions
+        from nerf_lightning.config.hydra_versions import hydra_main
+        from nerf_lightning.config.search_path import search_extensions
 
         if JSON in arguments:
             _require_table(command)

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.exporters import build_exporter
 from nerf_lightning.config.instantiate import build

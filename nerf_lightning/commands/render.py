@@ -6,7 +6,8 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoints, scene_to_look_at
 from nerf_lightning.data.captures.checks import known_background

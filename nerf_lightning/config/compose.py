@@ -13,9 +13,10 @@ from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config.error_messages import in_words
-from nerf_lightning.config.hydra_versions import DEFAULTS, search_extensions
+from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.config.instantiate import require_kinds
 from nerf_lightning.config.overrides import key_of
+from nerf_lightning.config.search_path import search_extensions
 from nerf_lightning.files.folders import conf_folder
 
 

@@ -1,4 +1,4 @@
-"""One interface to Hydra 1.3 and 1.4, a fix of 1.3 for Python 3.14, and the conf/ folders of extensions."""
+"""One interface to Hydra 1.3 and 1.4, and a fix of 1.3 for Python 3.14."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -8,13 +8,8 @@ from typing import Any
 import hydra
 from hydra import utils
 from hydra._internal import utils as internals
-from hydra.core.config_search_path import ConfigSearchPath
-from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, InstantiationException
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
-
-from nerf_lightning.files.folders import conf_folders
 
 IS_1_3 = hydra.__version__.startswith("1.3.")
 DEFAULTS = {"version_base": "1.3"} if IS_1_3 else {}
@@ -75,17 +70,3 @@ def options_parser() -> argparse.ArgumentParser:
     if IS_1_3:
         internals.argparse = SimpleNamespace(**vars(argparse) | {"ArgumentParser": _Parser})  # type: ignore[assignment]
     return internals.get_args_parser()
-
-
-class ExtensionsSearchPath(SearchPathPlugin):
-    """The `conf/` of every extension, after our own."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append the folders."""
-        for folder in conf_folders()[1:]:
-            search_path.append(provider=folder.parent.name, path=f"file://{folder}")
-
-
-def search_extensions() -> None:
-    """Let every config that Hydra composes from now on find the YAML files of extensions."""
-    Plugins.instance().register(ExtensionsSearchPath)

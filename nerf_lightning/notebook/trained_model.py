@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands.export import export as export_checkpoint
 from nerf_lightning.config.compose import compose_config, composed_job

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.checkpoints.same_capture import depth_sums
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction, takes_distances, with_longest

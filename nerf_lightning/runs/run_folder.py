@@ -22,7 +22,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.format import DAMAGED, LAST, PREVIOUS
+from nerf_lightning.checkpoints.reading import newest_checkpoint, read_checkpoint
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.overrides import key_of

@@ -1,4 +1,7 @@
-"""Attempts of a run, with weights drawn from seed and number; collapse guard and NaN guard decide on another."""
+"""Attempts of a run, with weights drawn from seed and number; collapse guard and NaN guard decide on another.
+
+How many there may be: `max_restarts` in conf/callbacks/default.yaml.
+"""
 
 import torch
 from torch.optim import Optimizer

@@ -10,8 +10,8 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nerf_lightning.checkpoints.format import KEY, LOOPS
-from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, read_content
+from nerf_lightning.checkpoints.format import KEY, LAST, LOOPS
+from nerf_lightning.checkpoints.reading import read_checkpoint, read_content
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.messages.errors import InputError

@@ -9,7 +9,8 @@ from support.planted import write_checkpoint
 from support.running import refused
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.reading import last_good_checkpoint, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.messages.errors import InputError
 

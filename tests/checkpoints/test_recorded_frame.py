@@ -8,7 +8,8 @@ from support.posed_captures import Known, read, ring, wall, write_colmap, write_
 from support.scenes import ball_scene
 from support.wrong_cameras import with_noise
 
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint, scene_record
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.record import make_record, scene_record
 from nerf_lightning.checkpoints.recorded_frame import as_trained, in_recorded_frame
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels

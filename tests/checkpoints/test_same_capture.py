@@ -6,7 +6,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.checkpoints.same_capture import changes, depth_sums, require_same_capture
 from nerf_lightning.data.pixels import decoded_photographs as hashes
 from nerf_lightning.data.pixels.decoded_photographs import photograph_hashes

@@ -20,7 +20,7 @@ from support.known_fields import ball, solid
 from support.posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.config.hydra_versions import DEFAULTS
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.sfm.photograph_folder import find_photographs

@@ -13,7 +13,7 @@ from support.running import FAST, done, said
 from support.scenes import ball_scene, tiny_field
 from torch import nn
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import row_chunks
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras

@@ -10,7 +10,7 @@ from support.configs import composed
 from support.running import refused
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.identity import settings_digest

@@ -19,7 +19,7 @@ from support.posed_captures import (
     write_transforms,
 )
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.export.cameras import CamerasExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion

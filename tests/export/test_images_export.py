@@ -10,7 +10,7 @@ from PIL import Image
 from support.known_fields import ball, solid
 from support.scenes import ball_scene, some_rays
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder

@@ -24,7 +24,8 @@ from support.posed_captures import Known, read, ring, write_colmap, write_llff, 
 from support.scenes import ball_scene
 from torch.utils.tensorboard import SummaryWriter
 
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.pixels.picture_files import image_size, read_rgba

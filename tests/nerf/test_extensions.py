@@ -14,7 +14,7 @@ from support.running import refused
 from support.scenes import ball_scene
 from support.steps import rays_of
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.export.images import ImagesExport

@@ -9,7 +9,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.hydra_versions import DEFAULTS, search_extensions
+from nerf_lightning.config.hydra_versions import DEFAULTS
+from nerf_lightning.config.search_path import search_extensions
 from nerf_lightning.files.folders import conf_file, conf_folder, conf_folders, option_names
 
 

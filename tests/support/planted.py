@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from support.configs import composed
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.config.instantiate import build
 
 Change = Callable[[dict[str, Any]], object]

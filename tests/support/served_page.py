@@ -12,7 +12,7 @@ from support.ports import unused_port
 from support.scenes import ball_scene, tiny_model
 from support.viser_client import ViserClient
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.extensions.viewer.guarded_server import Auth
 from nerf_lightning.extensions.viewer.page import Page
 from nerf_lightning.extensions.viewer.render_queue import RenderQueue

@@ -7,7 +7,7 @@ from unittest.mock import MagicMock
 import numpy as np
 from support.scenes import ball_scene, tiny_model
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.extensions.viewer.camera_state import quaternion_of
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.extensions.viewer.controls import Controls

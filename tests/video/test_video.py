@@ -14,7 +14,7 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 from support.videos import read_video
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.world_frame import similarity
 from nerf_lightning.video import encoding, exr

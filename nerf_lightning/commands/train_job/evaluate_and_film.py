@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Trainer
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.exporters import exporters_after_training
 from nerf_lightning.config.instantiate import build

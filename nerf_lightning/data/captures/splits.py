@@ -1,4 +1,4 @@
-"""Split views into training views and held-out views."""
+"""Split views into training views and held-out views: every Nth, by `hold_every` in conf/scene_defaults.yaml."""
 
 import logging
 from collections.abc import Callable, Hashable, Sequence

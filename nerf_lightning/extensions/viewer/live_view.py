@@ -9,7 +9,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.extensions.viewer.guarded_server import Auth

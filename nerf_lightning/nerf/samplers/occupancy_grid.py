@@ -1,6 +1,6 @@
 """The grid of an occupancy sampler: where its cells are, and what is known of each.
 
-`occupancy.py` chooses which cells are updated, and when.
+`occupancy.py` chooses which cells are updated, and when; the numbers are in conf/sampler/occupancy.yaml.
 """
 
 from typing import Any

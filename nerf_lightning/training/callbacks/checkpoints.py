@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.checkpoints.reading import BEST, LAST
+from nerf_lightning.checkpoints.format import BEST, LAST
 from nerf_lightning.files.atomic import remove_leftovers
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO

@@ -1,4 +1,7 @@
-"""The collapse guard: a run that renders a constant picture is detected early and restarted."""
+"""The collapse guard: a run that renders a constant picture is detected early and restarted.
+
+`nerf train` takes its numbers from conf/callbacks/default.yaml.
+"""
 
 import logging
 from typing import Any, ClassVar

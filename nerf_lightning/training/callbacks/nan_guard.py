@@ -1,4 +1,7 @@
-"""The NaN guard: a run whose numbers are no longer finite is stopped, or rolled back and continued at a lower rate."""
+"""The NaN guard: a run whose numbers are no longer finite is stopped, or rolled back and continued at a lower rate.
+
+`nerf train` takes its numbers from conf/callbacks/default.yaml.
+"""
 
 import logging
 from dataclasses import replace

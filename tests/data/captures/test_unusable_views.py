@@ -8,7 +8,7 @@ from support.captures import write_blender, write_npz
 from support.malformed import edit_json, refused
 from support.posed_captures import Known, read, write_colmap, write_transforms
 
-from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.messages.errors import InputError

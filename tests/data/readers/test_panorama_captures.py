@@ -10,7 +10,7 @@ from support.panoramas import near_the_bricks, write_panoramas
 from support.scenes import tiny_model
 from support.steps import rays_of
 
-from nerf_lightning.checkpoints.reading import make_record, scene_record
+from nerf_lightning.checkpoints.record import make_record, scene_record
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.doctor.examine import examine

@@ -9,7 +9,7 @@ from lightning.pytorch import Trainer
 from support.scenes import ball_scene, tiny_model
 from support.steps import rays_of
 
-from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.record import make_record
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError

@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.geometry.world_frame import points_from_user, similarity, upright_rotation

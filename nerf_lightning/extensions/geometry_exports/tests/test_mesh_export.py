@@ -14,7 +14,7 @@ from support.known_fields import INSIDE, SOFT, ball, solid
 from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.export.base import RunContext
 from nerf_lightning.extensions.geometry_exports.density_mesh import without_floaters
 from nerf_lightning.extensions.geometry_exports.fused_mesh import depth_rays

@@ -12,7 +12,7 @@ from support.peak_bytes import peak_bytes
 from support.posed_captures import Known, read, wall, write_llff
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.export.base import RunContext
 from nerf_lightning.export.visibility import num_agreeing, see
 from nerf_lightning.extensions.geometry_exports.points import (

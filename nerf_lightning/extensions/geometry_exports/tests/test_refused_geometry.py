@@ -10,7 +10,7 @@ import pytest
 from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.export import base
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.extensions.geometry_exports.points import PointsExport

@@ -11,7 +11,7 @@ from PIL import Image
 from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.extensions.geometry_exports.mesh import MeshExport
 from nerf_lightning.extensions.geometry_exports.texels import covered_texels
 from nerf_lightning.messages.errors import InputError

@@ -11,7 +11,7 @@ from support.known_fields import INSIDE, ball, solid
 from support.peak_bytes import peak_bytes
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.extensions.geometry_exports.density_grid import CHUNK
 from nerf_lightning.extensions.geometry_exports.surface import PAIRS, looks_from_facing, looks_from_nearest
 from nerf_lightning.extensions.geometry_exports.volume import BYTES_PER_POINT, VolumeExport

@@ -7,8 +7,8 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning import __version__
-from nerf_lightning.checkpoints.format import KEY
-from nerf_lightning.checkpoints.reading import LAST, Checkpoint, read_content
+from nerf_lightning.checkpoints.format import KEY, LAST
+from nerf_lightning.checkpoints.reading import Checkpoint, read_content
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.config.instantiate import require_fitting
 from nerf_lightning.config.load_model import load_model

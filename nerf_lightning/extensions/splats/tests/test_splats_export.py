@@ -16,7 +16,8 @@ from support.planted import in_config, write_checkpoint
 from support.running import refused
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import read_checkpoint, scene_record
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.commands.export import neutral_colors
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.export import base

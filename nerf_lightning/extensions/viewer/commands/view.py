@@ -4,7 +4,7 @@ from threading import Thread
 
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.extensions.viewer.guarded_server import Auth

@@ -8,7 +8,7 @@ from support.scenes import ball_scene, tiny_model
 from support.static_models import fast_model
 from support.steps import rays_of
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.record import scene_record
 from nerf_lightning.extensions.viewer import renderer as slices
 from nerf_lightning.extensions.viewer.camera_state import CameraState, camera_of, pose_of
 from nerf_lightning.extensions.viewer.channels import CHANNELS, FARTHEST, picture_of, planar_depth
