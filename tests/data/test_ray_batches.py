@@ -2,12 +2,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.pixel_batches import check_pixels
 from support.scenes import ball_scene
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.contrast import FLAT, shares
+from nerf_lightning.nerf.kernels.pixels import cpu
 from nerf_lightning.nerf.types.progress import Progress
 
 
@@ -194,3 +196,7 @@ def test_equal_pixels_are_drawn_alike():
     scene = ball_scene()
     scene = replace(scene, pixels=replace(scene.pixels, rgba=torch.full_like(scene.pixels.rgba, 99)))
     assert bool((RayBatches(scene, Progress(), 0, 64, candidates=4).batch_at(0, 0).weight == 1).all())
+
+
+def test_the_kernel_of_batches_is_their_reference_bit_by_bit():
+    check_pixels(cpu, "cpu", torch.Generator().manual_seed(0), 777)

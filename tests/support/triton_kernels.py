@@ -6,7 +6,8 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import torch
-from support.triton_batches import check_pixels, check_rays  # noqa: F401 -- check_all finds them by name
+from support.pixel_batches import check_pixels  # noqa: F401 -- check_all finds it by name
+from support.triton_rays import check_rays  # noqa: F401
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder

@@ -1,15 +1,55 @@
-"""Local contrast for the CPU, bit-identical to `nerf.contrast.contrast`."""
+"""Batches of pixels and their contrast for the CPU, bit-identical to `RayBatches.batch_at` and `nerf.contrast`."""
 
 from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.contrast import FLAT, HIGHEST, SHIFT
+from nerf_lightning.nerf.kernels.pixels.op import Domain
+from nerf_lightning.nerf.kernels.random.cpu import mix
 from nerf_lightning.nerf.kernels.threads import over_rows
+from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
+from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
+from nerf_lightning.nerf.types.scene import PixelStore
+
+
+def batch(
+    count: int,
+    size: int,
+    known_size: int,
+    candidates: int,
+    domain: Domain,
+    store: PixelStore,
+    shares: UInt8[Tensor, "pixels"] | None,
+    depths: KnownDepths | None,
+    numbers: Int[Tensor, "6"],
+) -> Batch:
+    """Return the batch (`op.ordered_batch`) of these numbers."""
+    several, first, key, chooser, known_first, known_key = numbers.tolist()
+    pixels = PixelIndex(*torch.empty(3, count, dtype=torch.int64))
+    rgba, weight = torch.empty(count, 4), torch.empty(count)
+    distance, certainty = torch.empty(2, count if depths is not None else 0)
+    # Arrays that are absent are empty, so that there is one kernel for all cases.
+    nothing, numbered = torch.empty(0, dtype=torch.uint8), torch.empty(0, dtype=torch.int64)
+    given = [numbered] * 3 + [torch.empty(0)] * 2 if depths is None else depths.tensors()
+    arrays = (
+        *domain,
+        store.offset,
+        store.width,
+        store.rgba,
+        *(nothing if x is None else x for x in (store.mask, shares)),
+    )
+    out = *pixels.tensors(), rgba, weight, distance, certainty
+    over_rows(
+        *(_batch, count, several, first, size, *grid_of(size), key, chooser, candidates),
+        *(known_first, known_size, *grid_of(known_size), known_key),
+        *(each.numpy() for each in (*arrays, *given, *out)),
+    )
+    return Batch(pixels, rgba, weight, *((None, None) if depths is None else (distance, certainty)))
 
 
 def contrast(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "height width"]:
@@ -21,7 +61,10 @@ def contrast(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "height wid
 
 def trial() -> None:
     """Run every kernel once on tiny input; it raises whatever the compiler raises."""
-    contrast(torch.zeros(1, 1, 4, dtype=torch.uint8))
+    rgba, zero, one = torch.zeros(1, 1, 4, dtype=torch.uint8), torch.zeros(1).long(), torch.ones(1).long()
+    shares = contrast(rgba).flatten()
+    store = PixelStore(rgba.view(1, 4), zero, one, one, has_transparency=True)
+    batch(1, 1, 1, 2, Domain(one, one, zero, zero, zero), store, shares, None, torch.tensor([1, 0, 0, 0, 0, 0]))
 
 
 @njit
@@ -46,3 +89,94 @@ def _contrast(first, last, rgba, flat, highest, shift, out):
                 change += _change(here, rgba[y, left], c) + _change(here, rgba[y, right], c)
                 most = max(most, change)
             out[y, x] = min((most >> shift) + flat, highest)
+
+
+@njit
+@no_type_check
+def _number(position, size, rows, columns, key):
+    """Return what is at a place of the order (`randomness.permute`)."""
+    epoch = position // size
+    number = position - epoch * size
+    start = mix(np.uint32(key) ^ mix(np.uint32(epoch)) ^ np.uint32(0x5A5A5A5A))
+    per_row, per_column = 1.0 / rows, 1.0 / columns
+    while True:
+        row = number // columns
+        column = number - row * columns
+        for each in range(FEISTEL_ROUNDS):
+            word = mix(np.uint32(start + np.uint32(each) * np.uint32(0x1B873593)))
+            if each % 2:
+                column = _modulo(column + np.int64(mix(word ^ np.uint32(row))), columns, per_column)
+            else:
+                row = _modulo(row + np.int64(mix(word ^ np.uint32(column))), rows, per_row)
+        number = row * columns + column
+        if number < size:
+            return number
+
+
+@njit
+@no_type_check
+def _modulo(number, size, per_size):
+    """Return number % size by the reciprocal of the size, of numbers below 2^52: the processor's division is slow."""
+    rest = number - np.int64(number * per_size) * size
+    if rest < 0:
+        return rest + size
+    return rest - size if rest >= size else rest
+
+
+@njit
+@no_type_check
+def _pixel(number, ends, across, views, left, top):
+    """Return view, x and y of a number of a domain."""
+    slot, high = 0, len(ends)
+    while slot < high:
+        middle = (slot + high) // 2
+        if ends[middle] <= number:
+            slot = middle + 1
+        else:
+            high = middle
+    within = number - (ends[slot - 1] if slot > 0 else 0)
+    row = within // across[slot]
+    return views[slot], within - row * across[slot] + left[slot], row + top[slot]
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _batch(
+    begin, end, several, first, size, rows, columns, key, chooser, candidates,
+    known_first, known_size, known_rows, known_columns, known_key,
+    ends, across, views, left, top,
+    offset, width, rgba, mask, shares,
+    known_view, known_x, known_y, known_distance, known_certainty,
+    out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
+):  # fmt: skip
+    for i in range(begin, end):
+        distance, certainty, kept = np.float32(1), np.float32(0), np.float32(1)
+        if i >= several:
+            number = _number(i - several + known_first, known_size, known_rows, known_columns, known_key)
+            view, x, y = known_view[number], known_x[number], known_y[number]
+            distance, certainty = known_distance[number], known_certainty[number]
+        else:
+            position = (i + first) * candidates
+            view, x, y = _pixel(_number(position, size, rows, columns, key), ends, across, views, left, top)
+            total, share, pixel = np.int64(0), np.int64(0), (view, x, y)
+            for each in range(candidates if candidates > 1 else 0):
+                other = pixel
+                if each > 0:
+                    number = _number(position + each, size, rows, columns, key)
+                    other = _pixel(number, ends, across, views, left, top)
+                own = np.int64(shares[offset[other[0]] + other[2] * width[other[0]] + other[1]])
+                total += own
+                word = mix(np.uint32(position + each) ^ np.uint32(chooser))
+                if np.int64(word >> np.uint32(8)) * total < (own << 24):
+                    view, x, y = other
+                    share = own
+            if candidates > 1:
+                kept = np.float32(total) / np.float32(max(candidates * share, 1))
+        flat = offset[view] + y * width[view] + x
+        if len(mask):
+            kept = np.float32(kept * np.float32(mask[flat]))
+        out_view[i], out_x[i], out_y[i], weight[i] = view, x, y, kept
+        for c in range(4):
+            colors[i, c] = np.float32(rgba[flat, c]) / np.float32(255)
+        if len(out_distance):
+            out_distance[i], out_certainty[i] = distance, np.float32(kept * certainty)

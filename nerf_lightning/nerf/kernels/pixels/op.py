@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cuda_backend
+from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.types.rays import KnownDepths, LazyBatch
 from nerf_lightning.nerf.types.scene import PixelStore
@@ -46,7 +46,7 @@ NOWHERE = Order(range(0), 1, 0)
 
 def has_kernel(device: torch.device) -> bool:
     """Return whether there is a kernel for a device."""
-    return cuda_backend("pixels.cuda", device) is not None
+    return backend_for("pixels", device) is not None
 
 
 def ordered_batch(
@@ -71,7 +71,7 @@ def ordered_batch(
         of_known: places among them.
         kind: the same for batches that differ in places and keys alone.
     """
-    kernels = cuda_backend("pixels.cuda", domain.ends.device)
+    kernels = backend_for("pixels", domain.ends.device)
     assert kernels is not None, "has_kernel is asked first"
     count = len(rays.places) + len(of_known.places)
     chooser = fold(rays.key, "contrast")

@@ -41,7 +41,8 @@ def trial() -> None:
 
 @njit
 @no_type_check
-def _mix(word):
+def mix(word):
+    """Return a hash of a word of 32 bits (`randomness.mix`)."""
     word = np.uint32(word)
     word ^= word >> np.uint32(16)
     word = np.uint32(word * np.uint32(0x7FEB352D))
@@ -56,9 +57,9 @@ def _mix(word):
 @no_type_check
 def _uniform(first, last, keys, slots, purpose, out):
     for r in range(first, last):
-        ray = _mix(np.uint32(_mix(np.uint32(keys[r]) ^ purpose) ^ _mix(np.uint32(slots[r]))))
+        ray = mix(np.uint32(mix(np.uint32(keys[r]) ^ purpose) ^ mix(np.uint32(slots[r]))))
         for k in range(out.shape[1]):
-            word = _mix(np.uint32(ray + np.uint32(k) * np.uint32(0x3C6EF35F)))
+            word = mix(np.uint32(ray + np.uint32(k) * np.uint32(0x3C6EF35F)))
             out[r, k] = np.float32(word >> np.uint32(8)) * np.float32(2.0**-24)
 
 
@@ -72,9 +73,9 @@ def _permute(first, last, index, rows, columns, size, words, out):
             for number in range(words.shape[0]):
                 word = np.int64(words[number])
                 if number % 2:
-                    column = (column + np.int64(_mix(np.uint32(word ^ row)))) % columns
+                    column = (column + np.int64(mix(np.uint32(word ^ row)))) % columns
                 else:
-                    row = (row + np.int64(_mix(np.uint32(word ^ column)))) % rows
+                    row = (row + np.int64(mix(np.uint32(word ^ column)))) % rows
             position = row * columns + column
             if position < size:
                 break
