@@ -186,7 +186,9 @@ class RayBatches:
         device, progress = self.prefetch_for, self.progress
         if device is None:
             while True:
-                batch_at = self._in_one_kernel if self._has_kernel else self.batch_at
+                # Steps are recorded on GPUs, and gather their batches themselves.
+                lazy = self._has_kernel and self.whole.ends.is_cuda
+                batch_at = self._in_one_kernel if lazy else self.batch_at
                 yield batch_at(progress.attempt, progress.rays_seen)
 
         def make(*position: int) -> Batch:

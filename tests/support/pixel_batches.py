@@ -1,10 +1,11 @@
 """The kernels that make batches against their reference."""
 
+from dataclasses import replace
 from itertools import product
-from types import SimpleNamespace
 from unittest.mock import patch
 
 import torch
+from support.scenes import ball_scene
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
@@ -27,7 +28,7 @@ def check_pixels(kernels, device, generator, rays):
     def batches(place, masked, every, candidates):
         arrays = (each.to(place) for each in (rgba, sizes.cumsum(0) - sizes, width, height))
         store = PixelStore(*arrays, True, mask.to(torch.uint8).to(place) if masked else None)
-        scene = SimpleNamespace(pixels=store, splits={"train": (3, 0, 2)}, depths=depths)
+        scene = replace(ball_scene(4), pixels=store, splits={"train": (3, 0, 2)}, depths=depths)
         made = RayBatches(scene, Progress(), 3, rays, depth_every=every, candidates=candidates)
         made.crop_to(0.5, 2, 2)
         return made
