@@ -1,5 +1,7 @@
 """`nerf help`, `nerf COMMAND --help` and `nerf completion`: answered from conf/ and docstrings, without Hydra.
 
+The list of commands, `nerf --help`, is in main.py.
+
 Hydra has completion scripts, too, but they compose the config at each key press, which takes seconds, and know neither
 our commands nor the values of a setting.
 """

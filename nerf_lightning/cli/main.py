@@ -1,4 +1,4 @@
-"""The console command: `nerf COMMAND ...` hands its arguments to one Hydra application per command.
+"""The console command: `nerf COMMAND ...` hands its arguments to one Hydra application per command; `nerf --help`.
 
 Nothing heavy is imported here, so that `nerf --help` answers at once.
 """

@@ -1,6 +1,6 @@
-"""What `nerf train` chooses for a scene if the user does not: model, time, and what comes before and after.
+"""What `nerf train` chooses for a scene if the user does not: time, and what comes before and after.
 
-Each choice is logged in one line, with the setting that changes it.
+The model is chosen in `model_for_scene.py`. Each choice is logged in one line, with the setting that changes it.
 """
 
 import copy

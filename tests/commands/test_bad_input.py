@@ -65,10 +65,13 @@ def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
         ("loss=robust loss.patch=32 data.batch_rays=1024", "loss.patch=32 draws squares of 32 x 32 pixels"),
         ("loss=robust loss.patch=4 data.batch_rays=40", "data.batch_rays=40 is not a multiple of that. Give"),
         ("loss=robust loss.share=0", "share=0: give 0.01 to 1.0"),
-        ("model=fast_small encoder.log2_table_size=30 encoder.max_resolution=9999", "GiB"),
+        ("model=fast_small data.crop_steps=0 encoder.log2_table_size=30 encoder.max_resolution=9999", "GiB"),
         ("model=fast_small data.sample_budget=100 data.crop_steps=5", "data.sample_budget=100"),
-        ("model=fast_small encoder.log2_table_size=34", "log2_table_size=34"),
-        ("model=fast_small encoder@direction_encoder=hash_grid", "directions do not lie in the unit cube"),
+        ("model=fast_small data.crop_steps=0 encoder.log2_table_size=34", "log2_table_size=34"),
+        (
+            "model=fast_small data.crop_steps=0 encoder@direction_encoder=hash_grid",
+            "directions do not lie in the unit cube",
+        ),
         ("field=null", "A group was given something other than the name of one of its options"),
     ],
 )

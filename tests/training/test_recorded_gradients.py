@@ -8,6 +8,7 @@ from support.gpu_training import step_by_step
 from support.tape import replay_steps
 from support.two_processes import in_two_processes
 
+from nerf_lightning.data.ray_batches import gather_batch
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import NoCorrection
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
@@ -16,6 +17,7 @@ from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.part import statistics
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.types.rays import LazyBatch
 from nerf_lightning.training.attempts import restart
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
@@ -63,6 +65,22 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
     assert sorted(size for size, _ in run.training.gradients.recordings) == [32, 48]
+
+
+def test_a_replay_gathers_a_lazy_batch_by_its_own_numbers():
+    runs = [trained([], record) for record in (True, False)]
+    for run in runs:
+        scene, domain = run.loader.scene, run.loader.whole
+
+        def gather(numbers, scene=scene, domain=domain):
+            return gather_batch(scene, domain.locate((numbers[0] + 7 * torch.arange(48)) % len(domain)))
+
+        for first in (0, 900, 11):
+            batch = LazyBatch(48, (first,), "rays", gather, CPU)
+            run.losses.append(run.training(batch, run.optimizer).losses.sum())
+    assert_same(*runs)
+    assert len(runs[0].training.gradients.recordings) == 1
+    assert runs[0].all_losses().unique().numel() == 3
 
 
 IN_TWO = """

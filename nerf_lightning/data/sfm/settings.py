@@ -1,4 +1,7 @@
-"""Settings of structure from motion, the attempts in order, and the costs of its stages."""
+"""Settings of structure from motion, the attempts in order, and the costs of its stages.
+
+How many frames are taken from a video, `video_frames.py` decides.
+"""
 
 from dataclasses import dataclass
 from typing import Literal

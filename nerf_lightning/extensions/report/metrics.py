@@ -1,4 +1,7 @@
-"""What `metrics.json` holds, as a page shows it. The file may be anybody's: what does not fit is left out."""
+"""What `metrics.json` holds, as a page shows it, in the columns of `evaluation/metrics_files.py`.
+
+The file may be anybody's: what does not fit is left out.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,7 @@
-"""One user's picture: coarse at once, then progressively finer while the request is unchanged."""
+"""One user's picture: coarse at once, then progressively finer while the request is unchanged.
+
+How coarse, `Renderer.height_while_moving` decides (renderer.py).
+"""
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass

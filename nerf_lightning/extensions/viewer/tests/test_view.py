@@ -118,7 +118,7 @@ def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(train, tm
         assert moved.std() > 10
         browser.refresh()
         wait_until(browser, lambda picture: picture.std() > 10)
-        assert browser.title == "bricks"
+        assert browser.title == "ball"
 
 
 def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
