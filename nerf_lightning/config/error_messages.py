@@ -56,7 +56,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
             f"A group was given something other than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
     if isinstance(error, (MemoryError, RuntimeError)):
-        return _of_machine(error)
+        return _memory_or_gpu_failure(error)
     if isinstance(error, OSError):
         # Closing something because of bad input may fail for the same cause, and replace the original error.
         cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
@@ -67,7 +67,7 @@ def paragraph(error: BaseException, command: str) -> str | None:
     return None
 
 
-def _of_machine(error: MemoryError | RuntimeError) -> str | None:
+def _memory_or_gpu_failure(error: MemoryError | RuntimeError) -> str | None:
     reason = " ".join(str(error).split())
     if not isinstance(error, MemoryError):
         # Imported late: it imports torch, which composing a config does not need and which may not fit into memory.

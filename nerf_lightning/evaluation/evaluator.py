@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 
 from nerf_lightning.compute import ranks
+from nerf_lightning.compute.environment import environment
 from nerf_lightning.evaluation.camera_fit import fitted_camera
 from nerf_lightning.evaluation.color_fit import exposure_fitted
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
@@ -17,7 +18,7 @@ from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.lpips import LPIPS, Net
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
-from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
+from nerf_lightning.evaluation.protocol import Colors, measured_how
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset

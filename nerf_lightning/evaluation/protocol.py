@@ -5,19 +5,15 @@ program; it differs from run to run, and says where a number came from.
 """
 
 import hashlib
-import platform
 import subprocess
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-import psutil
 import torch
 from torch import nn
 
 from nerf_lightning import __version__
-from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.config.overrides import leaves
 from nerf_lightning.config.setting_rules import fingerprint, meaning_of
 from nerf_lightning.evaluation.metrics_files import as_text
@@ -154,39 +150,6 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
 
 def _said(protocol: Mapping[str, Any], key: str) -> str:
     return as_text(protocol[key])[:80] if key in protocol else "not said"
-
-
-LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")
-
-
-def environment() -> dict[str, Any]:
-    """Return a description of the machine, including a GPU if there is one, and the installed versions."""
-    gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
-    return {
-        "python": platform.python_version(),
-        **{name: found for name in LIBRARIES if (found := _version(name)) is not None},
-        "system": platform.platform(),
-        "processor": _processor(),
-        "cores": num_cores(),
-        "memory_gigabytes": round(psutil.virtual_memory().total / 1e9, 1),
-        **({"gpus": gpus, "cuda": torch.version.cuda} if gpus else {}),
-    }
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine() or "unknown"
 
 
 def metric_lines(metrics: dict[str, Any], folder: Path, has_transparency: bool) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_csv, for_markdown
-from nerf_lightning.runs.table_cells import Row, cell_text
+from nerf_lightning.runs.table_columns import Row, cell_text
 
 
 def write_csv(rows: list[Row], path: Path) -> None:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from nerf_lightning.messages.console import StdoutConsole, say
 from nerf_lightning.messages.escaping import for_terminal, listed
-from nerf_lightning.runs.table_cells import DECIMALS, Row, shown_columns
+from nerf_lightning.runs.table_columns import DECIMALS, Row, shown_columns
 
 FIRST = ("job", "model", "PSNR", "resolution", "scene")
 """The most important columns, before the settings by which rows differ."""

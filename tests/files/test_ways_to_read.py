@@ -24,7 +24,7 @@ OURS = {
     "messages/console.py": ["print"],
     "training/loggers.py": ["open"],
     "runs/sweep.py": ["print"],
-    "evaluation/protocol.py": ["read_text"],
+    "compute/environment.py": ["read_text"],
     "training/launch/processes.py": ["open"],
     "config/scene_overrides.py": ["read_text", "safe_load"],
     "config/exporters.py": ["read_text", "safe_load"],

@@ -13,8 +13,8 @@ from nerf_lightning.messages.console import progress_bar
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9
-AUTO_SHARE = 0.5
-"""Share of the device's free memory: the rest is for tables, activations and evaluation."""
+PIXELS_SHARE_OF_FREE_MEMORY = 0.5
+"""How much of a GPU's free memory pixels may take: the rest is for tables, activations and evaluation."""
 CHUNK_BYTES = 1 << 26
 
 
@@ -27,7 +27,7 @@ def budget_bytes(budget: int | float | Literal["auto"], device: torch.device) ->
     """Return how much device memory the pixels may take: `budget` gigabytes, or half of what is free."""
     if budget != "auto":
         return int(budget * GIGABYTE)
-    return int(AUTO_SHARE * free_memory(device)) if device.type == "cuda" else 0
+    return int(PIXELS_SHARE_OF_FREE_MEMORY * free_memory(device)) if device.type == "cuda" else 0
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:

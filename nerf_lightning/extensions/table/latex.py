@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.extensions.table.columns import HIGH_FIRST, PLAIN, SPREAD
+from nerf_lightning.extensions.table.rows import HIGH_FIRST, PLAIN, SPREAD
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.runs.table_cells import Row, shown_columns
+from nerf_lightning.runs.table_columns import Row, shown_columns
 
 HIGHEST = tuple((SPREAD | PLAIN)[key] for key in HIGH_FIRST)
 LOWEST = tuple(column for column in SPREAD.values() if column not in HIGHEST)

@@ -17,7 +17,7 @@ class ImportanceSampler(DenseSampler):
 
     The histogram is of the interior intervals (without the first and last, as in the paper's code, so that light that a
     closed ray assigns to its last interval draws no samples). Positions carry no gradients: the weights are detached.
-    `FLOOR` in `kernels/histograms/op.py` is added to each weight, so that empty intervals draw samples, too.
+    `HISTOGRAM_PADDING` in `kernels/histograms/op.py` is added to each weight, so that empty intervals draw samples.
 
     Args:
         num_samples: intervals added to those of the previous level.

@@ -44,11 +44,11 @@ def a_histogram(rays=200, bins=9):
 
 
 @pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("floor", [0.0, 1e-5, 0.01])
-def test_samples_come_from_where_the_histogram_says(floor, contracted):
+@pytest.mark.parametrize("padding", [0.0, 1e-5, 0.01])
+def test_samples_come_from_where_the_histogram_says(padding, contracted):
     edges, weights = a_histogram()
     u = torch.rand(200, 12).sort(dim=-1).values
-    ours, plain = both(lambda: sample_histogram(edges[1:], weights[1:], u[1:], floor, contracted))
+    ours, plain = both(lambda: sample_histogram(edges[1:], weights[1:], u[1:], padding, contracted))
     torch.testing.assert_close(ours, plain, atol=2e-5, rtol=1e-4)
     assert bool((ours.diff(dim=-1) >= 0).all())
 

@@ -101,7 +101,7 @@ def test_inverse_sampling_equals_numpy_interpolation(generator):
     edges = torch.rand(6, 21, generator=generator, dtype=torch.float64).cumsum(-1)
     weights = torch.rand(6, 20, generator=generator, dtype=torch.float64) + 0.01
     u = torch.rand(6, 50, generator=generator, dtype=torch.float64)
-    ours = sample_histogram(edges, weights, u, floor=0.0)
+    ours = sample_histogram(edges, weights, u, padding=0.0)
     for row in range(6):
         cdf = np.concatenate([[0], np.cumsum(weights[row].numpy()) / weights[row].sum().item()])
         np.testing.assert_allclose(ours[row].numpy(), np.interp(u[row].numpy(), cdf, edges[row].numpy()), atol=1e-12)

@@ -12,11 +12,10 @@ from support.configs import composed
 from support.scenes import tiny_model
 from support.static_models import MODELS, fast_model
 
-from nerf_lightning.compute import devices, precision, xla_device
+from nerf_lightning.compute import devices, environment, precision, xla_device
 from nerf_lightning.compute.devices import working_device
 from nerf_lightning.compute.precision import choose_precision
 from nerf_lightning.config.error_messages import paragraph
-from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import matmul_precision
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16

@@ -13,9 +13,9 @@ from rich.progress import track
 from torch.utils import collect_env
 
 from nerf_lightning import __version__
+from nerf_lightning.compute.environment import environment
 from nerf_lightning.compute.precision import has_tf32
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.extensions.selftest import kernels, training
 from nerf_lightning.extensions.selftest.check import Row, carried_out, remarks, result_table
 from nerf_lightning.files.json_files import print_json, write_json

@@ -5,16 +5,16 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
-from nerf_lightning.extensions.table.columns import ORDERS, result_table
 from nerf_lightning.extensions.table.find_results import find_results
 from nerf_lightning.extensions.table.latex import write_latex
+from nerf_lightning.extensions.table.rows import ORDERS, result_table
 from nerf_lightning.files.html import write_page
 from nerf_lightning.files.json_files import print_json
 from nerf_lightning.messages.console import say, say_written
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.runs.command_folder import output_folder
 from nerf_lightning.runs.summary import FILES
-from nerf_lightning.runs.table_cells import DECIMALS, Row, shown_columns
+from nerf_lightning.runs.table_columns import DECIMALS, Row, shown_columns
 from nerf_lightning.runs.table_files import write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
 from nerf_lightning.nerf.kernels.histograms.op import (
-    FLOOR,
+    HISTOGRAM_PADDING,
     RayLoss,
     distortion,
     interlevel,
@@ -32,7 +32,7 @@ def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
-    floor: float = FLOOR,
+    padding: float = HISTOGRAM_PADDING,
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
@@ -40,7 +40,7 @@ def sample_histogram(
         return None
     out = torch.empty(u.shape)
     arrays = (each.detach().contiguous().numpy() for each in (edges, weights, u))
-    over_rows(_sample, len(u), *arrays, np.float32(floor), contracted, out.numpy())
+    over_rows(_sample, len(u), *arrays, np.float32(padding), contracted, out.numpy())
     return out
 
 
@@ -119,17 +119,17 @@ def _stratified(first, last, shares, shift, low, high, contracted, out):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _sample(first, last, edges, weights, u, floor, contracted, out):
+def _sample(first, last, edges, weights, u, padding, contracted, out):
     bins = weights.shape[1]
     for r in range(first, last):
         total = ZERO
         for i in range(bins):
-            total += weights[r, i] + floor
-        i, below, above = 0, ZERO, (weights[r, 0] + floor) / total
+            total += weights[r, i] + padding
+        i, below, above = 0, ZERO, (weights[r, 0] + padding) / total
         for k in range(u.shape[1]):
             while i < bins - 1 and above <= u[r, k]:
                 i += 1
-                below, above = above, above + (weights[r, i] + floor) / total
+                below, above = above, above + (weights[r, i] + padding) / total
             span = above - below
             part = min(max((u[r, k] - below) / span, ZERO), ONE) if span > ZERO else HALF
             left, right = _spaced(edges[r, i], contracted), _spaced(edges[r, i + 1], contracted)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import TINY
 from nerf_lightning.nerf.kernels.histograms.op import (
-    FLOOR,
+    HISTOGRAM_PADDING,
     RayLoss,
     distortion,
     interlevel,
@@ -33,7 +33,7 @@ def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
     weights: Float[Tensor, "*rays bins"],
     u: Float[Tensor, "*rays count"],
-    floor: float = FLOOR,
+    padding: float = HISTOGRAM_PADDING,
     contracted: bool = False,
 ) -> Float[Tensor, "*rays count"] | None:
     """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
@@ -45,7 +45,7 @@ def sample_histogram(
         bins, count = weights.shape[1], u.shape[1]
         block = triton.next_power_of_2(bins)
         sizes = bins, count, contracted, block, LANES
-        _sample[(len(u),)](*arrays, floor, TINY, *sizes, num_warps=_warps(block))
+        _sample[(len(u),)](*arrays, padding, TINY, *sizes, num_warps=_warps(block))
     return out
 
 
@@ -137,11 +137,11 @@ def _stratified(
 @triton.jit
 @no_type_check
 def _sample(
-    edges, weights, u, out, floor, tiny, bins, count, contracted: tl.constexpr, block: tl.constexpr, lanes: tl.constexpr
+    edges, weights, u, out, pad, tiny, bins, count, contracted: tl.constexpr, block: tl.constexpr, lanes: tl.constexpr
 ):
     ray, bin_index = tl.program_id(0).to(tl.int64), tl.arange(0, block)
     there = bin_index < bins
-    mass = tl.where(there, tl.load(weights + ray * bins + bin_index, mask=there, other=0.0) + floor, 0.0)
+    mass = tl.where(there, tl.load(weights + ray * bins + bin_index, mask=there, other=0.0) + pad, 0.0)
     share = mass / tl.sum(mass, axis=0)
     above = tl.cumsum(share, axis=0)
     below = above - share

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
-FLOOR = 1e-5
+HISTOGRAM_PADDING = 1e-5
 """Mass added to each bin of a histogram, unless its sampler says otherwise: an empty ray is sampled evenly."""
 
 

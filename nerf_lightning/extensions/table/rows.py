@@ -1,4 +1,4 @@
-"""Columns of measured runs in one table: a row per scene, model and setting, mean and standard deviation over seeds."""
+"""Measured runs as rows: one per scene, model and setting, with mean and standard deviation over seeds."""
 
 import statistics
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.runs.summary import differing_keys
-from nerf_lightning.runs.table_cells import Row
+from nerf_lightning.runs.table_columns import Row
 
 SPREAD = {
     "psnr": "PSNR",

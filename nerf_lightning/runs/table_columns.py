@@ -1,4 +1,4 @@
-"""The cells of a table: how many decimals each column has, and how its values are shown."""
+"""The columns of a table: how many decimals each has, and how its values are shown."""
 
 import re
 from typing import Any
