@@ -32,13 +32,17 @@ for (const table of tables) {
     const cells = [...table.rows].map(row => row.cells[column]), texts = cells.slice(1).map(cell => cell.textContent.trim()).filter(Boolean);
     if (column && texts.length && texts.every(text => NUMBER.test(text))) cells.forEach(cell => cell.classList.add("number"));
   });
-  for (const row of table.querySelectorAll("tbody tr"))
+  let above = "";
+  for (const row of table.querySelectorAll("tbody tr")) {
+    above = row.cells[0].textContent.trim() || above;
     [...row.cells].forEach((cell, column) => {
       cell.classList.toggle("blank", !cell.textContent.trim() && !cell.querySelector("img"));
+      if (!column && cell.matches(".blank") && above) cell.dataset.above = above;
       if (!column || names.length < LABELED || !names[column]) return;
       cell.dataset.column = names[column];
       cell.classList.toggle("short", cell.textContent.trim().length <= SHORT);
     });
+  }
 }
 // What a picture shows, below it; figures of notebooks have titles.
 for (const image of document.querySelectorAll("article p > img:only-child")) {

@@ -112,7 +112,7 @@ def depth_picture(
     opacity: Float[Tensor, "height width"] | None = None,
     scale_inside: bool = False,
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return depth in colors, near bright, with its scale on the right or in the lower right corner.
+    """Return depth in colors, near bright, with its scale on the right or in the upper right corner.
 
     If `opacity` is given, colors fade to pale gray where light passes through.
     """
@@ -215,7 +215,7 @@ def _with_scale(
 ) -> UInt8[Tensor, "height wider 3"]:
     """Add a slim color bar, from bright at `top` down to dark, with both texts: on the right, or inside.
 
-    Inside, it covers a corner and keeps the size; a picture too small for that has none.
+    Inside, it covers the upper right corner, since players' controls are below, and keeps the size; a picture too small for that has none.
     """
     size = letter_size(picture.shape[0])
     if not inside:
@@ -223,7 +223,7 @@ def _with_scale(
     margin = (0, 0, 0, 0, size // 3, size // 3)
     scale = torch.nn.functional.pad(_scale(4 * size, size, top, bottom), margin, value=PAPER)
     if scale.shape[0] <= picture.shape[0] // 2 and scale.shape[1] <= picture.shape[1] // 2:
-        picture[-scale.shape[0] :, -scale.shape[1] :] = scale
+        picture[: scale.shape[0], -scale.shape[1] :] = scale
     return picture
 
 

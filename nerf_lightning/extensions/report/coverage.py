@@ -38,7 +38,7 @@ def _directions(scene: SceneRecord) -> CoverageMap:
     azimuth, elevation = directions_seen(scene)
     return CoverageMap(
         f"Directions around the middle of the scene, in degrees: azimuth across, elevation up. Green is within "
-        f"{NEAR_ENOUGH:.0f} degrees of a photograph. Directions that you will not show need no photographs.",
+        f"{NEAR_ENOUGH:.0f} degrees of a photograph. Directions from which nobody will look need no photographs.",
         180,
         "".join(_row(180 - CELL * (row + 1), cells) for row, cells in enumerate(seen_cells(scene).tolist())),
         _dots(scene, azimuth + 180, 90 - elevation),
