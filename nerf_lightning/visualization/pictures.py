@@ -215,7 +215,8 @@ def _with_scale(
 ) -> UInt8[Tensor, "height wider 3"]:
     """Add a slim color bar, from bright at `top` down to dark, with both texts: on the right, or inside.
 
-    Inside, it covers the upper right corner, since players' controls are below, and keeps the size; a picture too small for that has none.
+    Inside, it covers the upper right corner, since players' controls are below, and keeps the size; a picture too
+    small for that has none.
     """
     size = letter_size(picture.shape[0])
     if not inside:
