@@ -9,16 +9,16 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.contrast import FLAT, HIGHEST, SHIFT
-from nerf_lightning.nerf.kernels.pixels.op import Domain
+from nerf_lightning.nerf.kernels.pixels.op import Domain, empty_batch
 from nerf_lightning.nerf.kernels.random.cpu import mix
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
-from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
+from nerf_lightning.nerf.types.rays import Batch, KnownDepths
 from nerf_lightning.nerf.types.scene import PixelStore
 
 
-def batch(
-    count: int,
+def fill(
+    batch: Batch,
     size: int,
     known_size: int,
     candidates: int,
@@ -27,29 +27,19 @@ def batch(
     shares: UInt8[Tensor, "pixels"] | None,
     depths: KnownDepths | None,
     numbers: Int[Tensor, "6"],
-) -> Batch:
-    """Return the batch (`op.ordered_batch`) of these numbers."""
+) -> None:
+    """Fill a batch (`op.ordered_batch`)."""
     several, first, key, chooser, known_first, known_key = numbers.tolist()
-    pixels = PixelIndex(*torch.empty(3, count, dtype=torch.int64))
-    rgba, weight = torch.empty(count, 4), torch.empty(count)
-    distance, certainty = torch.empty(2, count if depths is not None else 0)
     # Arrays that are absent are empty, so that there is one kernel for all cases.
-    nothing, numbered = torch.empty(0, dtype=torch.uint8), torch.empty(0, dtype=torch.int64)
-    given = [numbered] * 3 + [torch.empty(0)] * 2 if depths is None else depths.tensors()
-    arrays = (
-        *domain,
-        store.offset,
-        store.width,
-        store.rgba,
-        *(nothing if x is None else x for x in (store.mask, shares)),
-    )
-    out = *pixels.tensors(), rgba, weight, distance, certainty
+    nothing, numbered, real = (torch.empty(0, dtype=kind) for kind in (torch.uint8, torch.int64, torch.float32))
+    optional = [nothing if each is None else each for each in (store.mask, shares)]
+    known = [*[numbered] * 3, *[real] * 2] if depths is None else depths.tensors()
+    out = [*batch.tensors(), *([real] * 2 if depths is None else [])]
     over_rows(
-        *(_batch, count, several, first, size, *grid_of(size), key, chooser, candidates),
+        *(_batch, batch.num_rays, several, first, size, *grid_of(size), key, chooser, candidates),
         *(known_first, known_size, *grid_of(known_size), known_key),
-        *(each.numpy() for each in (*arrays, *given, *out)),
+        *(each.numpy() for each in (*domain, store.offset, store.width, store.rgba, *optional, *known, *out)),
     )
-    return Batch(pixels, rgba, weight, *((None, None) if depths is None else (distance, certainty)))
 
 
 def contrast(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "height width"]:
@@ -64,7 +54,8 @@ def trial() -> None:
     rgba, zero, one = torch.zeros(1, 1, 4, dtype=torch.uint8), torch.zeros(1).long(), torch.ones(1).long()
     shares = contrast(rgba).flatten()
     store = PixelStore(rgba.view(1, 4), zero, one, one, has_transparency=True)
-    batch(1, 1, 1, 2, Domain(one, one, zero, zero, zero), store, shares, None, torch.tensor([1, 0, 0, 0, 0, 0]))
+    numbers = torch.tensor([1, 0, 0, 0, 0, 0])
+    fill(empty_batch(1, zero.device, False), 1, 1, 2, Domain(one, one, zero, zero, zero), store, shares, None, numbers)
 
 
 @njit
@@ -98,29 +89,18 @@ def _number(position, size, rows, columns, key):
     epoch = position // size
     number = position - epoch * size
     start = mix(np.uint32(key) ^ mix(np.uint32(epoch)) ^ np.uint32(0x5A5A5A5A))
-    per_row, per_column = 1.0 / rows, 1.0 / columns
     while True:
         row = number // columns
         column = number - row * columns
         for each in range(FEISTEL_ROUNDS):
             word = mix(np.uint32(start + np.uint32(each) * np.uint32(0x1B873593)))
             if each % 2:
-                column = _modulo(column + np.int64(mix(word ^ np.uint32(row))), columns, per_column)
+                column = (column + np.int64(mix(word ^ np.uint32(row)))) % columns
             else:
-                row = _modulo(row + np.int64(mix(word ^ np.uint32(column))), rows, per_row)
+                row = (row + np.int64(mix(word ^ np.uint32(column)))) % rows
         number = row * columns + column
         if number < size:
             return number
-
-
-@njit
-@no_type_check
-def _modulo(number, size, per_size):
-    """Return number % size by the reciprocal of the size, of numbers below 2^52: the processor's division is slow."""
-    rest = number - np.int64(number * per_size) * size
-    if rest < 0:
-        return rest + size
-    return rest - size if rest >= size else rest
 
 
 @njit
@@ -150,28 +130,25 @@ def _batch(
     out_view, out_x, out_y, colors, weight, out_distance, out_certainty,
 ):  # fmt: skip
     for i in range(begin, end):
+        view, x, y = np.int64(0), np.int64(0), np.int64(0)
         distance, certainty, kept = np.float32(1), np.float32(0), np.float32(1)
         if i >= several:
             number = _number(i - several + known_first, known_size, known_rows, known_columns, known_key)
             view, x, y = known_view[number], known_x[number], known_y[number]
             distance, certainty = known_distance[number], known_certainty[number]
         else:
-            position = (i + first) * candidates
-            view, x, y = _pixel(_number(position, size, rows, columns, key), ends, across, views, left, top)
-            total, share, pixel = np.int64(0), np.int64(0), (view, x, y)
-            for each in range(candidates if candidates > 1 else 0):
-                other = pixel
-                if each > 0:
-                    number = _number(position + each, size, rows, columns, key)
-                    other = _pixel(number, ends, across, views, left, top)
-                own = np.int64(shares[offset[other[0]] + other[2] * width[other[0]] + other[1]])
+            total, share, start = np.int64(0), np.int64(0), (i + first) * candidates
+            for position in range(start, start + candidates):
+                number = _number(position, size, rows, columns, key)
+                view_of, x_of, y_of = _pixel(number, ends, across, views, left, top)
+                own = np.int64(1)
+                if candidates > 1:
+                    own = np.int64(shares[offset[view_of] + y_of * width[view_of] + x_of])
                 total += own
-                word = mix(np.uint32(position + each) ^ np.uint32(chooser))
-                if np.int64(word >> np.uint32(8)) * total < (own << 24):
-                    view, x, y = other
-                    share = own
-            if candidates > 1:
-                kept = np.float32(total) / np.float32(max(candidates * share, 1))
+                word = mix(np.uint32(position) ^ np.uint32(chooser))
+                if position == start or np.int64(word >> np.uint32(8)) * total < (own << 24):
+                    view, x, y, share = view_of, x_of, y_of, own
+            kept = np.float32(total) / np.float32(max(candidates * share, 1))
         flat = offset[view] + y * width[view] + x
         if len(mask):
             kept = np.float32(kept * np.float32(mask[flat]))

@@ -11,7 +11,7 @@ import triton.language as tl
 from jaxtyping import Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.pixels.op import Domain
+from nerf_lightning.nerf.kernels.pixels.op import Domain, empty_batch
 from nerf_lightning.nerf.kernels.random.cuda import mix
 from nerf_lightning.nerf.randomness import FEISTEL_ROUNDS, grid_of
 from nerf_lightning.nerf.types.rays import Batch, KnownDepths, PixelIndex
@@ -21,8 +21,8 @@ BLOCK = 64
 """Small, so that a batch of some thousand pixels keeps a whole GPU busy: each walks through its permutation."""
 
 
-def batch(
-    count: int,
+def fill(
+    batch: Batch,
     size: int,
     known_size: int,
     candidates: int,
@@ -31,15 +31,12 @@ def batch(
     shares: UInt8[Tensor, "pixels"] | None,
     depths: KnownDepths | None,
     numbers: Int[Tensor, "6"],
-) -> Batch:
-    """Return the batch (`op.ordered_batch`) of numbers on the device, in the order in which the kernel loads them."""
-    device = store.rgba.device
-    view, x, y = (torch.empty(count, dtype=torch.int64, device=device) for _ in range(3))
-    rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
-    distance, certainty = (None, None) if depths is None else (torch.empty_like(weight), torch.empty_like(weight))
+) -> None:
+    """Fill a batch (`op.ordered_batch`) by numbers on the device, in the order in which the kernel loads them."""
+    count = batch.num_rays
     if count:
         _batch[(triton.cdiv(count, BLOCK),)](
-            *(view, x, y, rgba, weight, distance, certainty),
+            *(*batch.pixels.tensors(), batch.rgba, batch.weight, batch.distance, batch.certainty),
             *(numbers, count, size, *grid_of(size), known_size, *grid_of(known_size)),
             *(*domain, len(domain.ends), len(domain.ends).bit_length()),
             *(store.offset, store.width, store.rgba, store.mask, shares),
@@ -47,7 +44,6 @@ def batch(
             *(candidates, FEISTEL_ROUNDS),
             BLOCK,
         )
-    return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
 
 
 def trial(device: str = "cuda") -> None:
@@ -61,7 +57,8 @@ def trial(device: str = "cuda") -> None:
     store = PixelStore(rgba.view(8, 4).to(torch.uint8), ends - 4, 0 * views + 2, 0 * views + 2, has_transparency=True)
     depths = KnownDepths(PixelIndex(views, views, 0 * views), views + 1.5, views + 0.5)
     numbers = torch.tensor([8, 0, 1, 0, 0, 1], device=device)
-    found = batch(10, 8, 2, 1, domain, store, None, depths, numbers)
+    found = empty_batch(10, numbers.device, True)
+    fill(found, 8, 2, 1, domain, store, None, depths, numbers)
     number = 4 * found.pixels.view + 2 * found.pixels.y + found.pixels.x
     right = torch.equal(number[:8].sort().values, torch.arange(8, device=device))
     if not right or not torch.equal((255 * found.rgba[:, 0]).round(), 4.0 * number):

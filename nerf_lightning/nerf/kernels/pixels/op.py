@@ -1,7 +1,6 @@
 """Batches of pixels in one kernel, if there is one; the reference is in `data.ray_batches.RayBatches.batch_at`."""
 
 from collections.abc import Hashable
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import backend_for
 from nerf_lightning.nerf.randomness import fold
-from nerf_lightning.nerf.types.rays import KnownDepths, LazyBatch
+from nerf_lightning.nerf.types.rays import Batch, KnownDepths, LazyBatch, PixelIndex
 from nerf_lightning.nerf.types.scene import PixelStore
 
 
@@ -77,5 +76,19 @@ def ordered_batch(
     chooser = fold(rays.key, "contrast")
     numbers = len(rays.places), rays.places.start, rays.key, chooser, of_known.places.start, of_known.key
     sizes = rays.size, of_known.size, rays.candidates
-    gather = partial(kernels.batch, count, *sizes, domain, store, shares, depths)
-    return LazyBatch(count, numbers, kind, gather, domain.ends.device)
+    device = domain.ends.device
+
+    def gather(on_device: Int[Tensor, "6"]) -> Batch:
+        batch = empty_batch(count, device, depths is not None)
+        kernels.fill(batch, *sizes, domain, store, shares, depths, on_device)
+        return batch
+
+    return LazyBatch(count, numbers, kind, gather, device)
+
+
+def empty_batch(count: int, device: torch.device, has_depths: bool) -> Batch:
+    """Return a batch whose arrays hold anything."""
+    view, x, y = torch.empty(3, count, dtype=torch.int64, device=device)
+    rgba, weight = torch.empty(count, 4, device=device), torch.empty(count, device=device)
+    distance, certainty = (torch.empty_like(weight) if has_depths else None for _ in range(2))
+    return Batch(PixelIndex(view, x, y), rgba, weight, distance, certainty)
