@@ -21,6 +21,11 @@ function markWide() {
   for (const table of tables) table.classList.toggle("wide", wide.has(String(columns(table))));
 }
 
+// A number and its unit stay on one line.
+const UNIT = /(\d) (?=(dB|s|ms|min|h|GB|MB|kB|%)(?!\w))/g;
+const words = document.createTreeWalker(document.querySelector("article"), NodeFilter.SHOW_TEXT);
+while (words.nextNode()) if (!words.currentNode.parentElement.closest("pre, code")) words.currentNode.data = words.currentNode.data.replace(UNIT, "$1\u00a0");
+
 for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
   const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [], long = LONG[code.closest("td") ? "td" : ""];
   while (walk.nextNode()) texts.push(walk.currentNode);

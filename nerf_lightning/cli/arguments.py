@@ -118,8 +118,8 @@ def require_settings(words: Sequence[str], or_paths: bool) -> None:
             )
 
 
-def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
-    """Return the arguments with all paths gathered into `key=...`.
+def named_paths(arguments: list[str], key: str) -> list[str]:
+    """Return the arguments with all paths gathered into `key=...`; `runs` takes several.
 
     An argument is a path if it has no `=` or if it exists: the folders of a sweep's jobs are named `0_seed=0`. So is
     `ckpt=PATH`, which other commands take.
@@ -132,7 +132,7 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
         return arguments
     from nerf_lightning.config.overrides import quoted  # imports Hydra
 
-    if len(paths) > 1 and not several:
+    if len(paths) > 1 and key != "runs":
         raise InputError(f"{key} takes one folder, but {len(paths)} were given: {', '.join(paths)}.")
-    value = f"[{','.join(map(quoted, paths))}]" if several else quoted(paths[0])
+    value = f"[{','.join(map(quoted, paths))}]" if key == "runs" else quoted(paths[0])
     return [*(word for word in arguments if word not in paths), f"{key}={value}"]

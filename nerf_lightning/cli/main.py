@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.cli.arguments import quoted_paths
-from nerf_lightning.cli.prepare import PATHS_ALONE, is_sweep, prepared, sweep_arguments
+from nerf_lightning.cli.prepare import is_sweep, prepared, sweep_arguments
 from nerf_lightning.cli.process import (
     announce_start,
     ends_quietly,
@@ -23,6 +23,7 @@ from nerf_lightning.cli.process import (
     require_no_settings_here,
     was_interrupted,
 )
+from nerf_lightning.config.help.catalogue import command_named
 from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
@@ -166,7 +167,8 @@ def _run(command: str, arguments: list[str]) -> None:
         if JSON in arguments:
             _require_table(command)
         arguments = options_first([_setting_of(word) for word in arguments], command)
-        require_settings(arguments, or_paths=command in PATHS_ALONE)
+        known = command_named(command)
+        require_settings(arguments, or_paths=known is not None and known.path_setting is not None)
         allow_as_typed(arguments)
         arguments = quoted_paths(arguments, is_sweep(arguments))
         sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from nerf_lightning.cli.arguments import named_paths, unquoted
 from nerf_lightning.cli.process import quick_imports
 from nerf_lightning.compute.slurm import was_requeued
+from nerf_lightning.config.help.catalogue import Command, command_named
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 
@@ -145,11 +146,12 @@ log = logging.getLogger(__name__)
 
 def prepared(command: str, arguments: list[str]) -> list[str]:
     """Return a command's arguments, preceded by the remembered ones; the user's own come last and take precedence."""
-    if command in PATHS_ALONE:
-        key = PATHS_ALONE[command]
-        arguments = named_paths(arguments, key, several=key == "runs")
-    prepare = PREPARED.get(command)
-    return arguments if prepare is None else prepare(arguments)
+    known = command_named(command)
+    if known is not None and known.path_setting is not None:
+        arguments = named_paths(arguments, known.path_setting)
+    if command in PREPARED:
+        return PREPARED[command](arguments)
+    return arguments if known is None else _of_run(known, arguments)
 
 
 def _train(arguments: list[str]) -> list[str]:
@@ -179,14 +181,14 @@ def _refuse_second_sweep(arguments: list[str]) -> None:
         )
 
 
-def _eval(arguments: list[str]) -> list[str]:
+def _eval(arguments: list[str], path_setting: str = "ckpt") -> list[str]:
     """Add the run's own scene if the user names none, so that the checkpoint suffices.
 
     The scene's class comes from our conf/, by the name that the checkpoint recorded; only plain values (paths, sizes,
     background) are taken from the file.
     """
     given = [argument.partition("=") for argument in arguments]
-    checkpoints = [value for key, _, value in given if key == "ckpt"]
+    checkpoints = [value for key, _, value in given if key == path_setting]
     if not checkpoints or any(key in ("scene", "--help") for key, _, _ in given):
         return arguments
     checkpoint = unquoted(checkpoints[-1])
@@ -198,8 +200,14 @@ def _eval(arguments: list[str]) -> list[str]:
     return [*scene_overrides(checkpoint), *arguments]
 
 
-def _view(arguments: list[str]) -> list[str]:
-    """Add the run's own scene as for `eval`; without it, show cameras without photographs unless they are requested."""
+def _of_run(command: Command, arguments: list[str]) -> list[str]:
+    """Add the run's own scene to a command that reads one; if it is unknown, do without, unless it is asked for."""
+    if "scene" not in command.groups or command.path_setting is None:
+        return arguments
+    if "photographs" not in {setting.key for setting in command.written}:
+        with suppress(InputError):  # the command says what it lacks
+            return _eval(arguments, command.path_setting)
+        return arguments
     wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
     if "true" in map(str.lower, wished[-1:]):
         return _eval(arguments)
@@ -212,7 +220,6 @@ def _export(arguments: list[str]) -> list[str]:
     typed = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
     with quick_imports():
         from nerf_lightning.config.exporters import exporter_class
-        from nerf_lightning.config.help.catalogue import command_named
 
         if not typed:
             command = command_named("export")
@@ -240,27 +247,9 @@ def _eval_or_without(arguments: list[str], without: list[str], said: str) -> lis
         return [*without, *arguments]
 
 
-def _report(arguments: list[str]) -> list[str]:
-    """Add the run's own scene if the user names none."""
-    given = dict(argument.partition("=")[::2] for argument in arguments)
-    if "run" not in given or "scene" in given or given.get("doctor", "").lower() == "false":
-        return arguments
-    from nerf_lightning.config.scene_overrides import scene_overrides
-
-    try:
-        recorded = scene_overrides(str(Path(unquoted(given["run"])) / "checkpoints" / "last.ckpt"))
-    except InputError:
-        return arguments  # the page says so
-    return [*recorded, *arguments]
-
-
 PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
     "train": _train,
     "eval": _eval,
-    "view": _view,
     "export": _export,
-    "report": _report,
+    "render": lambda arguments: arguments,  # needs the checkpoint alone
 }
-
-PATHS_ALONE = {"table": "runs", "report": "run", **dict.fromkeys(("eval", "render", "view", "export"), "ckpt")}
-"""Commands that accept paths without a key, and the setting that such paths fill."""

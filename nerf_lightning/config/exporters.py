@@ -19,8 +19,8 @@ from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 
-NO_EXPORTERS = ("evaluate", "video", "report")
-"""Keys of `final` that name no exporter."""
+NO_EXPORTERS = ("evaluate", "video")
+"""Keys of `final` that name no exporter; nor do options of conf/final/."""
 
 
 def exporter_class(name: str) -> Any:
@@ -38,7 +38,7 @@ def exporters_after_training(final: DictConfig) -> dict[str, Any]:
     exporters = {}
     for name, value in final.items():
         wanted = value if isinstance(value, DictConfig) else SWITCH.get(value, value)
-        if name not in NO_EXPORTERS and wanted not in (False, "auto"):
+        if name not in (*NO_EXPORTERS, *option_names("final")) and wanted not in (False, "auto"):
             exporters[str(name)] = _exporter(str(name), wanted)
     return exporters
 

@@ -16,6 +16,7 @@ from torch import nn
 from nerf_lightning import __version__
 from nerf_lightning.config.overrides import leaves
 from nerf_lightning.config.setting_rules import fingerprint, meaning_of
+from nerf_lightning.evaluation.metrics import SSIM_SIGMA, SSIM_WINDOW
 from nerf_lightning.evaluation.metrics_files import as_text
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.rendering.background import at_evaluation
@@ -58,7 +59,7 @@ def measured_how(
         "masks": "none" if scene.pixels.mask is None else "left out",
         "psnr": "mean of the pictures' own",
         "cc_psnr": "after an affine fit of each picture's colors, by least squares",
-        "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
+        "ssim": f"torchmetrics, Gaussian {SSIM_WINDOW} x {SSIM_WINDOW}, sigma {SSIM_SIGMA}",
         "lpips": None if lpips is None else f"{lpips}, version 0.1",
         **scene.protocol,
     }

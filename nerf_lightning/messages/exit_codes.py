@@ -3,7 +3,7 @@
 FAILED = 1
 """A job of a sweep, or a check of the selftest, has failed."""
 BAD_INPUT = 2
-"""Bad input was explained in one paragraph."""
+"""Bad input, a full disk or memory, a failing GPU: explained in one paragraph (`explained` in cli/main.py)."""
 INTERRUPTED = 130
 """128 + SIGINT."""
 READER_LEFT = 141

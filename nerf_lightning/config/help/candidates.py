@@ -10,7 +10,6 @@ from nerf_lightning.files.folders import option_names
 
 SHELLS = ("bash", "zsh", "fish")
 FLAGS = ("--help", "--multirun", "--cfg", "--config-dir", "--hydra-help")
-TAKES_PATHS = ("table", "report")  # Commands that accept a folder without a key
 LITERALS = {"bool": ("true", "false"), "null": ("null",)}
 
 
@@ -40,7 +39,7 @@ def _possible(before: list[str], current: str, commands: list[str]) -> Iterable[
         return FLAGS
     if "=" in current:
         return _values(command, *current.split("=", 1))
-    return [*_keys(command, current, before), *(_paths(current) if command.name in TAKES_PATHS else ())]
+    return [*_keys(command, current, before), *(_paths(current) if command.path_setting else ())]
 
 
 def _keys(command: Command, current: str, before: list[str]) -> Iterator[str]:

@@ -11,6 +11,7 @@ from nerf_lightning.files.folders import conf_file, option_names
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""
+PATH_SETTINGS = ("ckpt", "run", "runs")
 REQUIRED = "(required)"
 """Placeholder for the value of a setting that the user must provide."""
 TAKES = {"bool": "bool", "int": "int", "float": "float", "seq": "list"}
@@ -62,6 +63,11 @@ class Command:
         own = {key: entry for key, entry in file.entries.items() if root(key) != "hydra"}
         self.written = _settings(own, f"nerf {name}", lambda key: root(key) not in sections)
         """The settings of its own YAML."""
+
+    @property
+    def path_setting(self) -> str | None:
+        """The setting that takes paths which are typed without a key; None: this command takes none."""
+        return next((setting.key for setting in self.written if setting.key in PATH_SETTINGS), None)
 
     @cached_property
     def options(self) -> dict[str, list[Option]]:

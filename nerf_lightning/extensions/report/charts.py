@@ -27,12 +27,20 @@ class Chart:
     """Whether a smoothed curve is drawn as well."""
     from_zero: bool = False
     """Whether the axis begins at zero."""
+    note: str = ""
+    """What its curves are, where their names do not say it."""
 
 
 # Only names of these forms are drawn: others may be anything.
 CHARTS = (
     Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)"), is_noisy=True),
-    Chart("Training loss", re.compile(r"Training loss/(\w{1,40})"), is_logarithmic=True, is_noisy=True),
+    Chart(
+        "Training loss",
+        re.compile(r"Training loss/(\w{1,40})"),
+        is_logarithmic=True,
+        is_noisy=True,
+        note="The weighted terms of the loss, by term or by level of the model, and their sum.",
+    ),
     Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
     Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True, from_zero=True),
     Chart("Memory (GB)", re.compile(r"memory/(\w{1,40})_gigabytes"), from_zero=True),
@@ -49,7 +57,7 @@ class Drawing(NamedTuple):
     curves: list[dict[str, Any]]
     """Each with its `label`, `steps` and `values`."""
     note: str
-    """What of it is not drawn; empty: all is."""
+    """What its curves are, and which are not drawn; empty: nothing to say."""
 
 
 def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
@@ -70,7 +78,8 @@ def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
         ]
         if distinct:
             more = len(distinct) - MOST_CURVES
-            note = f"{more} more curves are in the run's TensorBoard files." if more > 0 else ""
+            left = f"{more} more curves are in the run's TensorBoard files." if more > 0 else ""
+            note = f"{chart.note} {left}".strip() if len(distinct) > 1 else ""
             shown = distinct[:MOST_CURVES]
             drawings.append(Drawing(chart.label, chart.is_logarithmic, chart.is_noisy, chart.from_zero, shown, note))
     return drawings

@@ -117,6 +117,7 @@ function draw(figure, chart) {
 
   place.replaceChildren();
   const svg = put(place, "svg", {width, height: HEIGHT, role: "img", "aria-label": chart.label});
+  put(svg, "rect", {class: "grid", x: LEFT, y: TOP, width: width - LEFT - RIGHT, height: HEIGHT - TOP - BOTTOM});
   const heights = chart.is_logarithmic ? logarithmic(low, high) : ticks(low, high, 5), levels = short(heights.map(back));
   heights.forEach((value, k) => {
     put(svg, "line", {class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value)});

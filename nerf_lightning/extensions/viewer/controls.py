@@ -26,6 +26,8 @@ STYLE = Path(__file__).parent / "panel.css"
 NARROW = 576  # Windows less wide (pixels) have viser's panel for phones.
 SAVE = "Save picture"  # Names are those of exported pages.
 LEAST_SHARE = 0.01  # The crop box keeps at least this share of the scene's box along each axis.
+MOVES = "Drag to rotate, drag with the right button to move, scroll to zoom. W A S D Q E fly."
+MOVES_BY_TOUCH = "One finger rotates; two move and zoom."
 NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
 
@@ -54,6 +56,7 @@ class Controls:
         # viser's panel cannot begin folded, and would cover half of a phone.
         phone = session.client.camera.image_width < NARROW
         with self.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext():
+            self.gui.add_markdown(MOVES_BY_TOUCH if phone else MOVES)
             self.status = self.gui.add_markdown("")
             session.on_picture = self._tell
             if training is not None:

@@ -1,7 +1,7 @@
 // ---- Named views, notes and distances: the file of what.views, in the capture's own frame ------------------------
 
 const TOUCH = matchMedia("(pointer: coarse)").matches, TAP_ON = TOUCH ? "Tap" : "Click";
-const MIDDLE = TOUCH ? "" : ", or press Enter for the middle";
+const MIDDLE = TOUCH ? "" : ", or press Enter for the center of the window";
 const NARROW = matchMedia("(max-width: 700px)"), TOLD = 6000;  // milliseconds that a result stays
 const GAP = 4;  // pixels between labels
 const ASKS = {
@@ -45,6 +45,8 @@ class Marks {
     this.asks = asks;
     byId("told").textContent = ASKS[asks] ?? "";
     document.body.classList.toggle("asking", asks !== null);
+    byId("add-note").setAttribute("aria-pressed", String(asks === "note"));
+    byId("measure").setAttribute("aria-pressed", String(["distance", "second"].includes(asks)));
     if (asks !== null && NARROW.matches) byId("tools").open = false;  // the drawer lies over what is to be tapped
     byId("scene").focus();  // where Enter stands for the middle
   }
