@@ -59,18 +59,10 @@ def _unknown(monkeypatch):
     monkeypatch.setattr(prepare, "_eval", unknown)
 
 
-def test_a_page_goes_without_photographs_and_says_so_unless_they_were_wished_for(caplog):
+def test_a_page_goes_without_photographs_and_says_so(caplog):
     typed = ["ckpt=a", "what=page"]
     assert prepare._export(typed) == ["photographs=false", *typed]
     assert caplog.messages == ["what=page does not use photographs: nobody knows it"]
-    with pytest.raises(UnknownScene):
-        prepare._view(["ckpt=a", "photographs=True"])
     assert prepare._export(["ckpt=a", "what=cameras"]) == ["ckpt=a", "what=cameras"]
     assert prepare._export(["ckpt=a"]) == ["photographs=false", "ckpt=a"]
     assert prepare._export(["ckpt=a", "what=my_own"])[0] == "photographs=false"
-
-
-@pytest.mark.parametrize(("wish", "said"), [([], 1), (["photographs=false"], 0)])
-def test_so_does_the_viewer_and_says_so_unless_they_were_not_wished_for(caplog, wish, said):
-    assert prepare._view(["ckpt=a", *wish]) == ["photographs=false", "ckpt=a", *wish]
-    assert len(caplog.messages) == said

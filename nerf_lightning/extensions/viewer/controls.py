@@ -103,9 +103,12 @@ class Controls:
             sliders = []
             for axis, a, b in zip("xyz", *in_user_frame(record), strict=True):
                 least, lower, upper = rounded_range(a, b)
-                sliders.append(self.gui.add_multi_slider(axis, lower, upper, least, (lower, upper), min_range=least))
+                label = f"{axis}: {lower:g} to {upper:g}"
+                sliders.append(self.gui.add_multi_slider(label, lower, upper, least, (lower, upper), min_range=least))
 
         def update(_: Any) -> None:
+            for axis, slider in zip("xyz", sliders, strict=True):
+                slider.label = f"{axis}: {slider.value[0]:g} to {slider.value[1]:g}"
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
             self.frusta.draw_box(self.session.crop)

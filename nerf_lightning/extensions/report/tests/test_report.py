@@ -47,7 +47,7 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert "left out" not in output
     metrics = json.loads((finished_run / "metrics.json").read_text())
     result = json.loads((finished_run / "run.json").read_text())["result"]
-    assert re.search(r"dB on held-out photographs, .+ To improve it, .+\.", result)
+    assert re.search(r"dB on held-out photographs; .+ To improve it, .+\.", result)
     assert html.unescape(re.search(r'<p id="result">(.+)</p>', text)[1]) == result
     # The page was made from a copy: its command names the copy.
     assert f'<pre id="command">nerf train resume={path.parent / "run"} ' in text

@@ -123,10 +123,11 @@ def test_the_last_movement_wins_over_one_that_is_still_being_read(tmp_path):
 
 def test_the_crop_box_is_the_scenes(tmp_path):
     panel = Panel(tmp_path)
-    assert panel.gui.made["x"].value == pytest.approx((-1.0, 1.0))
+    assert panel.gui.made["x: -1 to 1"].value == pytest.approx((-1.0, 1.0))
     panel.gui.made["Show only what is in the box"].value = True
-    panel.gui.made["z"].value = (0.0, 0.5)
-    panel.gui.made["z"].act(None)
+    panel.gui.made["z: -1 to 1"].value = (0.0, 0.5)
+    panel.gui.made["z: -1 to 1"].act(None)
+    assert panel.gui.made["z: -1 to 1"].label == "z: 0 to 0.5"
     assert panel.session.crop.size.tolist() == pytest.approx([2.0, 2.0, 0.5])
     assert panel.queue.work()
 
