@@ -20,7 +20,7 @@ from nerf_lightning.config.exporters import build_exporter
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.evaluation.main_numbers import main_numbers
+from nerf_lightning.evaluation.main_numbers import SHOWN_FIRST, main_numbers
 from nerf_lightning.export.base import Export, Neutral, RunContext
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say, say_written
@@ -109,11 +109,10 @@ def run_context(
     """Return what is known about a checkpoint's run: its photographs, its metrics, and a camera path."""
     checkpoint = opened.checkpoint
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
-    # A page is drawn by the browser, whatever time the model takes.
-    metrics = read_json_object(run / "metrics.json") | {"frames_per_second": None}
+    metrics = read_json_object(run / "metrics.json")
     known = [
         ("model", checkpoint.choices.get("model", "")),
-        *main_numbers(metrics, read_note(run)),
+        *(pair for pair in main_numbers(metrics, read_note(run)) if pair[0] in SHOWN_FIRST),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None

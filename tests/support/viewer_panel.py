@@ -66,7 +66,7 @@ class Gui:
 class Panel:
     """A person's panel over a ball, and the queue that serves them."""
 
-    def __init__(self, folder, scene=None, exports=None, **changed):
+    def __init__(self, folder, scene=None, exports=None, width=16, **changed):
         capture, scene = scene, scene or ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
         self.queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
@@ -74,7 +74,7 @@ class Panel:
         self.client.gui = self.gui
         c2w, camera = record.cameras.c2w[0], self.client.camera
         camera.wxyz, camera.position, camera.fov = quaternion_of(c2w), c2w[:, 3].double().numpy(), 0.6
-        camera.image_width, camera.image_height, camera.aspect = 16, HEIGHT, 16 / HEIGHT
+        camera.image_width, camera.image_height, camera.aspect = width, HEIGHT, width / HEIGHT
         camera.look_at, camera.up_direction = np.zeros(3), np.array([0.0, 0.0, 1.0])
         around = frame_of(record.cameras, record.aabb)
         self.session = ViewerClient(self.client, self.queue, Photographs(record, capture, "white"), around, HEIGHT)

@@ -30,8 +30,10 @@ class Comparison:
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the metrics of splats and field in one row each, with its label."""
-        rows = [("quality", self.splats, f" on {self.views}"), ("the model's", self.field, ", without lens distortion")]
-        return [(label, f"PSNR {row['psnr']:.2f} dB{_ssim(row)}{how}") for label, row, how in rows if row is not None]
+        rows = [("quality", self.splats, f" on {self.views}")]
+        if self.field is not None:
+            rows.append(("quality of the model", self.field, " on the same views, both without lens distortion"))
+        return [(label, f"PSNR {row['psnr']:.2f} dB{_ssim(row)}{how}") for label, row, how in rows]
 
     def psnr(self) -> str:
         """Return a summary for the user."""

@@ -23,7 +23,7 @@ from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
 STYLE = Path(__file__).parent / "panel.css"
-NARROW = 576  # Windows less wide (pixels) have viser's panel for phones.
+PHONE = 0.7  # Width over height of windows on phones; their pixels are as many as a desktop's.
 SAVE = "Save picture"  # Names are those of exported pages.
 LEAST_SHARE = 0.01  # The crop box keeps at least this share of the scene's box along each axis.
 MOVES = "Drag to rotate, drag with the right button to move, scroll to zoom. W A S D Q E fly."
@@ -54,7 +54,7 @@ class Controls:
         session.on_finest = self._keep_snapshot
         self.gui.add_html(f"<style>{STYLE.read_text(encoding='utf-8')}</style>")
         # viser's panel cannot begin folded, and would cover half of a phone.
-        phone = session.client.camera.image_width < NARROW
+        phone = session.client.camera.image_width < PHONE * session.client.camera.image_height
         with self.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext():
             self.gui.add_markdown(MOVES_BY_TOUCH if phone else MOVES)
             self.status = self.gui.add_markdown("")

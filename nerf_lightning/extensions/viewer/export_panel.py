@@ -6,6 +6,7 @@ from typing import Any
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.escaping import for_terminal
+from nerf_lightning.runs.file_steps import STEPS
 
 MOST_BYTES = 1 << 28  # A larger file would fill the memory of browser and viewer.
 MOST_LETTERS = 60
@@ -13,7 +14,7 @@ MOST_LETTERS = 60
 
 def exported_files(folder: Path) -> list[Path]:
     """Return the files of a run's exports in a folder, which may be missing; links may lead anywhere."""
-    found = (file for file in sorted(folder.glob("*")) if not file.name.startswith("."))
+    found = (file for file in sorted(folder.glob("*")) if not file.name.startswith(".") and file.name != STEPS)
     return [file for file in found if file.is_file() and not file.is_symlink()]
 
 

@@ -37,7 +37,7 @@ def run(config: DictConfig) -> None:
     run_folder = exports.parent
     page = Page(queue, photographs, folder, auth, config.port, config.max_height, exports=exports, run=run_folder)
     stopped = received_stop_signals()
-    say(f"The page is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
+    say(f"The viewer is at {page.address} (Ctrl-C stops it)", *tunnel(page.address))
     if config.photographs and scene is None:  # large ones take long, and the page does not need them to start
         Thread(target=lambda: photographs.take(read_photographs(config, opened)), daemon=True).start()
     try:

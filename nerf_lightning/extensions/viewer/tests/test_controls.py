@@ -69,7 +69,8 @@ def test_the_scale_of_depths_is_shown_with_them_in_the_captures_units():
 
 
 def test_on_phones_the_panel_begins_folded(tmp_path):
-    assert "Controls" in Panel(tmp_path).gui.made  # its window is 16 pixels wide
+    assert "Controls" in Panel(tmp_path, width=6).gui.made
+    assert "Controls" not in Panel(tmp_path).gui.made
 
 
 def test_a_full_disk_is_said_and_ends_nothing(tmp_path, monkeypatch):

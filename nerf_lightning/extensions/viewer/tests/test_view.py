@@ -39,7 +39,7 @@ def serve(*arguments):
     lines = ""
     for line in process.stdout:
         lines += line
-        found = re.search(r"The page is at (http://\S+)", line)
+        found = re.search(r"The viewer is at (http://\S+)", line)
         if found:
             return Served(process, found[1], lines)
     raise AssertionError(lines)
