@@ -27,6 +27,7 @@ const words = document.createTreeWalker(document.querySelector("article"), NodeF
 while (words.nextNode()) if (!words.currentNode.parentElement.closest("pre, code")) words.currentNode.data = words.currentNode.data.replace(UNIT, "$1\u00a0");
 
 for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
+  code.classList.toggle("short", code.matches(".literal") && code.textContent.length <= LONG.td);
   const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [], long = LONG[code.closest("td") ? "td" : ""];
   while (walk.nextNode()) texts.push(walk.currentNode);
   texts.filter(text => text.length > long).forEach(text => mayBreak(text, long));
@@ -43,7 +44,7 @@ for (const table of tables) {
     [...row.cells].forEach((cell, column) => {
       cell.classList.toggle("blank", !cell.textContent.trim() && !cell.querySelector("img"));
       if (!column && cell.matches(".blank") && above) cell.dataset.above = above;
-      if (!column || names.length < LABELED || !names[column]) return;
+      if ((!column && !NUMBER.test(cell.textContent.trim())) || names.length < LABELED || !names[column]) return;
       cell.dataset.column = names[column];
       cell.classList.toggle("short", cell.textContent.trim().length <= SHORT);
     });

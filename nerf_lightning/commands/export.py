@@ -20,7 +20,7 @@ from nerf_lightning.config.exporters import build_exporter
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_correction
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.evaluation.main_numbers import SHOWN_FIRST, main_numbers
+from nerf_lightning.evaluation.main_numbers import main_numbers
 from nerf_lightning.export.base import Export, Neutral, RunContext
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say, say_written
@@ -42,6 +42,9 @@ from nerf_lightning.video.settings import Corner, crop_corners
 from nerf_lightning.video.shots import Subject, content_of, frame_around
 
 Keyframes = tuple[dict[str, Any], ...]
+
+BESIDES_QUALITY = ("training", "steps", "parameters", "size of the weights")
+"""What a page says of a model; it compares the quality itself, on its own views without lens distortion."""
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +115,7 @@ def run_context(
     metrics = read_json_object(run / "metrics.json")
     known = [
         ("model", checkpoint.choices.get("model", "")),
-        *(pair for pair in main_numbers(metrics, read_note(run)) if pair[0] in SHOWN_FIRST),
+        *(pair for pair in main_numbers(metrics, read_note(run)) if pair[0] in BESIDES_QUALITY),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     neutral = neutral_colors(checkpoint, opened.trusted) if corrected and photographs is not None else None

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +11,8 @@ MOST_CURVES = 12
 """In one chart; more are not told apart, and a stranger's file may have thousands."""
 DIGITS = 5
 MOST_EQUAL = 3  # Names of one curve
+LEVEL = "gradients/norm_"
+"""Begins the tag of a curve of each level of the model."""
 LARGEST_STEP = 10**12
 """An untrusted file may number steps beyond what a script can count."""
 
@@ -33,13 +35,18 @@ class Chart:
 
 # Only names of these forms are drawn: others may be anything.
 CHARTS = (
-    Chart("PSNR (dB)", re.compile(r"PSNR/(train_\w{1,40}|validation)"), is_noisy=True),
+    Chart(
+        "PSNR (dB)",
+        re.compile(r"PSNR/(train_\w{1,40}|validation)"),
+        is_noisy=True,
+        note="Training: the rays of a step. Validation: some rays of the held-out views, always the same.",
+    ),
     Chart(
         "Training loss",
         re.compile(r"Training loss/(\w{1,40})"),
         is_logarithmic=True,
         is_noisy=True,
-        note="The weighted terms of the loss, by term or by level of the model, and their sum.",
+        note="The weighted terms of the loss, their sum over each level of the model, and the sum of all.",
     ),
     Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
     Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True, from_zero=True),
@@ -65,7 +72,7 @@ def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
     drawings = []
     for chart in CHARTS:
         matched = {tag: match[1] for tag in sorted(curves) if (match := chart.tags.fullmatch(tag))}
-        labels = _labels(matched)
+        labels = _labels(matched, curves)
         finite = {tag: _finite(curves[tag], chart) for tag in matched}
         # Equal curves, such as a level's loss of one term, would hide each other.
         equal: dict[tuple[Any, ...], list[str]] = {}
@@ -85,11 +92,12 @@ def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
     return drawings
 
 
-def _labels(names: Mapping[str, str]) -> dict[str, str]:
+def _labels(names: Mapping[str, str], curves: Iterable[str]) -> dict[str, str]:
     """Return what each curve is called: `train_fine` is "training", or, of several levels, "training (fine)"."""
     levels = [name for name in names.values() if name.startswith("train_")]
-    training = {name: "training" if len(levels) == 1 else f"training ({name[6:]})" for name in levels}
-    return {tag: training.get(name, name.replace("_", " ")) for tag, name in names.items()}
+    called = {name: "training" if len(levels) == 1 else f"training ({name[6:]})" for name in levels}
+    called |= {tag[len(LEVEL) :]: f"{tag[len(LEVEL) :]} level" for tag in curves if tag.startswith(LEVEL)}
+    return {tag: called.get(name, name.removeprefix("photo_").replace("_", " ")) for tag, name in names.items()}
 
 
 def _finite(curve: Curve, chart: Chart) -> Curve:

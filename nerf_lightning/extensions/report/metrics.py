@@ -16,6 +16,8 @@ from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.errors import InputError
 
 ROWS = {
+    ("protocol", "scene"): "scene's name",
+    ("origin", "scene"): "scene=",
     ("protocol", "split"): "views",
     ("protocol", "split_hash"): "fingerprint of these views",
     ("protocol", "pixels"): "colors of the render",
@@ -108,7 +110,7 @@ def depth_scale(metrics: dict[str, Any]) -> str:
     near, far = number(scale.get("near")), number(scale.get("far"))
     if near is None or far is None:
         return ""
-    return f"bright: {near:.3g}, dark: {far:.3g} {str(scale.get('unit', ''))[:40]}"
+    return f"bright: {near:.3g}, dark: {far:.3g} ({str(scale.get('unit', ''))[:40]})"
 
 
 def _name(key: str) -> str:

@@ -123,7 +123,7 @@ function draw(figure, chart) {
     put(svg, "line", {class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value)});
     put(svg, "text", {x: LEFT - 6, y: y(value) + 4, "text-anchor": "end"}, levels[k]);
   });
-  const marked = ticks(first, last, Math.max(2, width / 110)), steps = short(marked);
+  const marked = ticks(first, last, Math.max(2, width / 75)), steps = short(marked);
   marked.forEach((step, k) =>
     put(svg, "text", {x: x(step), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle"}, steps[k]));
   put(svg, "text", {x: width - RIGHT, y: HEIGHT - 3, "text-anchor": "end"}, "step");

@@ -106,7 +106,7 @@ def write_page(
         "title": title or run.name or record.name,
         "facts": [
             ("This page", facts),
-            ("Model (test views, lens distortion included)" if record.splits.get("test") else "Model", run.facts),
+            ("Model", run.facts),
         ],
         "views": [_view(record, run, view if max_photographs else None) for view in views],
         "still": _webp(_still(shown, record, first), STILL),

@@ -16,7 +16,7 @@ from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
-COLOR, DEPTH = "Color", "Depth"  # As on exported pages.
+COLOR, DEPTH, NORMALS = "Color", "Depth", "Normals"  # As on exported pages.
 AROUND, LINE = 24, 255  # Gray levels: around a photograph, as on exported pages, and of the seam.
 # Depths are sent losslessly with every picture: more pixels per side take time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
@@ -41,7 +41,7 @@ def depth_scale(view: View, record: SceneRecord) -> str:
     colors = ", ".join(f"rgb({r} {g} {b})" for r, g, b in bright_to_dark)
     ramp = f'<i style="flex:1;height:10px;border-radius:2px;background:linear-gradient(to right, {colors})"></i>'
     line = f'<div style="display:flex;gap:8px;align-items:center">near {near} {ramp} far {far}</div>'
-    return f'<div style="padding:0 1em 0.5em;font-size:0.85em">{line}Pale gray: nothing is there</div>'
+    return f'<div style="padding:0 1em 0.5em;font-size:0.85em">{line}Gray: no surface</div>'
 
 
 def _depth(view: View) -> Float[Tensor, "height width 3"]:
@@ -64,7 +64,7 @@ CHANNELS: dict[str, Callable[[View], Tensor]] = {
     COLOR: lambda view: view.rgb,
     DEPTH: _depth,
     "Opacity": lambda view: view.opacity[..., None].expand(-1, -1, 3),
-    "Normals": _normals,
+    NORMALS: _normals,
 }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.extensions.viewer.channels import CHANNELS, DEPTH, depth_scale
+from nerf_lightning.extensions.viewer.channels import CHANNELS, DEPTH, NORMALS, depth_scale
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.extensions.viewer.export_panel import ExportPanel
 from nerf_lightning.extensions.viewer.frusta import Frusta
@@ -71,6 +71,7 @@ class Controls:
     def _add_view(self, degrees: float) -> None:
         channel = self.gui.add_dropdown("Shown", tuple(CHANNELS), initial_value=self.session.channel)
         self.scale = self.gui.add_html("", visible=False)
+        self.axes = self.gui.add_markdown("Red, green, blue: along x, y, z.", visible=channel.value == NORMALS)
         fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, degrees)
         snapshot = self.gui.add_button(SAVE, hint="Save the finest picture of this view as PNG")
 
@@ -79,7 +80,7 @@ class Controls:
         def _(_: Any) -> None:
             self.session.channel = channel.value
             self.session.present()
-            self.scale.visible = channel.value == DEPTH
+            self.scale.visible, self.axes.visible = channel.value == DEPTH, channel.value == NORMALS
 
         @fov.on_update
         @self.harmless
@@ -120,7 +121,7 @@ class Controls:
     def _tell(self, view: View, finest: bool) -> None:
         height, width = view.opacity.shape
         self.scale.content = depth_scale(view, self.session.photographs.record)
-        said = f"{width} x {height} pixels{'' if finest else ', refining'}"
+        said = f"Rendered at {width} x {height}{'' if finest else ', refining'}"
         if said != self.status.content:
             self.status.content = said
 

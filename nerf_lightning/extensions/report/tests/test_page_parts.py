@@ -47,7 +47,7 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
     (psnr,) = drawn(curves)  # of the losses, one point each can be drawn
-    assert (psnr.label, psnr.note) == ("PSNR (dB)", "")
+    assert psnr.label == "PSNR (dB)"
     assert [curve["label"] for curve in psnr.curves] == ["training", "validation"]
     assert psnr.curves[0]["values"] == [10.0, 20.0, 25.0]
     two = drawn({f"PSNR/train_{level}": (steps, [1.0, 2.0, end]) for level, end in (("coarse", 3.0), ("fine", 4.0))})
@@ -56,9 +56,11 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
 
 
 def test_equal_curves_are_drawn_once_under_both_names():
-    losses = {"proposal": 1.0, "interlevel": 1.0, "fine": 2.0}
-    (drawing,) = drawn({f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()})
-    assert [curve["label"] for curve in drawing.curves] == ["fine", "interlevel = proposal"]
+    losses = {"proposal": 1.0, "photo_interlevel": 1.0, "fine": 2.0}
+    curves = {f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()}
+    levels = {f"gradients/norm_{name}": ([1], [1.0]) for name in ("proposal", "fine")}
+    (drawing,) = drawn(curves | levels)
+    assert [curve["label"] for curve in drawing.curves] == ["fine level", "interlevel = proposal level"]
 
 
 @pytest.mark.parametrize("space", ["contracted", "ndc"])
@@ -114,5 +116,5 @@ def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():
     columns, rows = per_image({"per_image": [{"name": "a", "psnr": 28.5, "cc_psnr": 29}]})
     assert (columns, rows) == (["name", "PSNR", "PSNR with fitted colors"], [["a", "28.50 dB", "29.00 dB"]])
     scale = {"near": 2.4444, "far": 9.6, "unit": "meters"}
-    assert depth_scale({"depth_scale": scale}) == "bright: 2.44, dark: 9.6 meters"
+    assert depth_scale({"depth_scale": scale}) == "bright: 2.44, dark: 9.6 (meters)"
     assert depth_scale({"depth_scale": {"near": "x"}}) == depth_scale({}) == ""

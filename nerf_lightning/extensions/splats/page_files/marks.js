@@ -78,7 +78,7 @@ class Marks {
     } else {
       this.begin(null);
       this.add("distances", { from: this.first, to: point });
-      const said = this.metres === null ? " scene units (no scale known)" : "";
+      const said = this.metres === null ? " in the capture's units (its scale is unknown)" : "";
       byId("told").textContent = this.told(this.lists.distances.at(-1)) + said;
       clearTimeout(this.passing);
       this.passing = setTimeout(() => this.forget(), TOLD);

@@ -400,6 +400,8 @@ async function start() {
     frames.marks.listen();
     document.body.classList.add("running");
     home(frames);
+    const compare = sourceOf(frames.view.photograph) ? "; drag the handle to compare with the photograph" : "";
+    byId("told").textContent = `${TOUCH ? "One finger turns, two move and zoom" : "Drag to turn, scroll to zoom"}${compare}.`;
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) frames.turn(true);
   } catch (error) {
     if (!(error instanceof Refusal)) console.error(error);

@@ -168,8 +168,8 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, finishe
     assert "dB on 1 test view; the model, compared in the same way" in result.out
     assert f"{tmp_path}/page.html" in result.out
     text = (tmp_path / "page.html").read_text()
-    psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]
-    assert f"{psnr:.2f} dB" in text
+    parameters = json.loads((finished_run / "metrics.json").read_text())["origin"]["parameters"]
+    assert f"<th>parameters</th><td>{parameters:,}</td>" in text
     assert text.count('alt="ball_') + text.count('<button type="button" data-view') >= 8
     (tmp_path / "page.html").write_text("something else")
     said(

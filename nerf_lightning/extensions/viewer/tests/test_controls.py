@@ -50,10 +50,10 @@ def test_the_size_of_the_picture_is_on_the_panel():
     panel = Panel(Path())
     panel.work()
     panel.session.on_picture(seen(panel, 6, 8), False)
-    assert panel.controls.status.content == "8 x 6 pixels, refining"
+    assert panel.controls.status.content == "Rendered at 8 x 6, refining"
     panel.session.refinement.refresh()
     panel.work()
-    assert panel.controls.status.content == "16 x 12 pixels"
+    assert panel.controls.status.content == "Rendered at 16 x 12"
 
 
 def test_the_scale_of_depths_is_shown_with_them_in_the_captures_units():
