@@ -2,6 +2,8 @@
 
 Reading returns the tensors that a model loads, in float32. The record consists only of tensors, numbers and words, and
 its unpacked size is checked against a budget before anything is allocated (`budgets.unpacked_bytes`).
+
+Which weights are quantized, and how: `extensions/pruning/quantized_weights.py`.
 """
 
 import math

@@ -1,6 +1,8 @@
 """Which classes an untrusted checkpoint may name: our parts of models and corrections that follow a contract.
 
 The user adds other modules with `trust=`; no file can.
+
+What the pickle in a checkpoint may build: GLOBALS in `files/tensor_files.py`.
 """
 
 import importlib

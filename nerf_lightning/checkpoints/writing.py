@@ -1,4 +1,7 @@
-"""Checkpoint files that are complete at every moment: a crash leaves the old one or the new one, never half of one."""
+"""Checkpoint files that are complete at every moment: a crash leaves the old one or the new one, never half of one.
+
+When they are written: `training/callbacks/checkpoints.py`. Their names: `format.py`.
+"""
 
 import os
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Evaluate a checkpoint: PSNR, SSIM, LPIPS, and errors of depth and normals if ground truth is known."""
+"""Evaluate a checkpoint: PSNR, SSIM, LPIPS, and errors of depth and normals if ground truth is known.
+
+What is measured by default: `conf/evaluation/default.yaml`; how: `evaluation/`.
+"""
 
 import torch
 from omegaconf import DictConfig

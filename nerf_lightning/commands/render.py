@@ -1,4 +1,7 @@
-"""Render a film (video) along a camera path."""
+"""Render a film (video) along a camera path.
+
+Its settings: `conf/render.yaml`; the camera path's: `conf/path/`; codecs: `video/encoding.py`.
+"""
 
 from dataclasses import replace
 from typing import Any, cast

@@ -1,4 +1,7 @@
-"""What Slurm says about this job, and how to requeue it."""
+"""What Slurm says about this job, and how to requeue it.
+
+Time limits and cores of jobs: `conf/hydra/launcher/slurm.yaml`.
+"""
 
 import logging
 import os

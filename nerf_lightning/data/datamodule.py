@@ -1,4 +1,7 @@
-"""The LightningDataModule: flattens every picture of a scene into ray batches."""
+"""The LightningDataModule: flattens every picture of a scene into ray batches.
+
+Batch size and other numbers: `conf/data/rays.yaml`, and those of each model in `conf/model/`.
+"""
 
 import logging
 from dataclasses import replace

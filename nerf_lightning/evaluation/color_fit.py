@@ -1,4 +1,7 @@
-"""Renders whose colors are fitted to photographs: the remaining error is not due to exposure or white balance."""
+"""Renders whose colors are fitted to photographs: the remaining error is not due to exposure or white balance.
+
+It is off by default: `colors` in conf/evaluation/default.yaml.
+"""
 
 import torch
 from jaxtyping import Bool, Float

@@ -1,4 +1,7 @@
-"""Measure a model on the views of a split: metrics per picture, their summary, and the protocol of the measurement."""
+"""Measure a model on the views of a split: metrics per picture, their summary, and the protocol of the measurement.
+
+`conf/evaluation/default.yaml` has the defaults; `conf/train.yaml` changes them for the end of training.
+"""
 
 import logging
 import time

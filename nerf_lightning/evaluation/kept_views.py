@@ -1,4 +1,7 @@
-"""Keep the pictures of some scored views, evenly spaced, and of the worst."""
+"""Keep the pictures of some scored views, evenly spaced, and of the worst.
+
+How many: `num_pictures` and `num_worst` in conf/evaluation/default.yaml.
+"""
 
 import io
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,7 @@
-"""LPIPS (arXiv 1801.03924, version 0.1) as torchmetrics computes it, on a backbone of torchvision (the extra lpips)."""
+"""LPIPS (arXiv 1801.03924, version 0.1) as torchmetrics computes it, on a backbone of torchvision (the extra lpips).
+
+It is off by default: `lpips` in conf/evaluation/default.yaml.
+"""
 
 from pathlib import Path
 from typing import Literal

@@ -39,7 +39,9 @@ class RunContext:
     crop: CropBox | None = None
     """The part of the scene to export; None: all of it."""
     min_opacity: float = 0.5
-    """Minimum opacity of a pixel that sees a surface; behind fainter matter, which is left out, there is nothing."""
+    """Minimum opacity of a pixel that sees a surface; behind fainter matter, which is left out, there is nothing.
+
+    `nerf export` has its own default in conf/export.yaml."""
 
 
 MODEL_ALONE = RunContext()

@@ -1,4 +1,7 @@
-"""Compute what the photographs show: where each pixel's light was absorbed, and whether views agree."""
+"""Compute what the photographs show: where each pixel's light was absorbed, and whether views agree.
+
+How opaque a surface must be: `min_opacity` in conf/export.yaml.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

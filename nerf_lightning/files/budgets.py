@@ -2,6 +2,8 @@
 
 Files are untrusted. Each limit is far above what valid files need, and low enough that no file fills the memory or
 takes hours. Users raise limits on the command line (`budgets.views=500000`); files cannot.
+
+`conf/budgets/default.yaml` repeats the limits for the command line; a test compares the two.
 """
 
 import math

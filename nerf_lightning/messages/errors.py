@@ -1,4 +1,7 @@
-"""The one error that is addressed to the user: bad input, explained in one paragraph with its cure."""
+"""The one error that is addressed to the user: bad input, explained in one paragraph with its cure.
+
+Errors of Hydra, of full memory and of GPUs are put into words in `config/error_messages.py`.
+"""
 
 from collections.abc import Iterable
 from importlib import import_module

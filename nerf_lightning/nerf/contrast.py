@@ -4,6 +4,8 @@ Most of the error lies along edges, which few evenly drawn pixels show. A candid
 contrast, and its weight in the loss makes up for that: the expected gradient is that of evenly drawn pixels (resampled
 importance sampling, Talbot et al. 2005, "Importance Resampling for Global Illumination", Eq. 6). All numbers are whole,
 so every device chooses the same pixels.
+
+How many candidates: `candidates` in conf/data/rays.yaml and in conf/model/.
 """
 
 import torch

@@ -1,4 +1,7 @@
-"""Skip steps whose gradients are not finite, before they ruin the weights."""
+"""Skip steps whose gradients are not finite, before they ruin the weights.
+
+How many in a row end a run: `nan_guard` in conf/callbacks/default.yaml.
+"""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,8 @@
-"""Validation: the squared error of fixed rays, as evaluation shows them, over all processes of a run."""
+"""Validation: the squared error of fixed rays, as evaluation shows them, over all processes of a run.
+
+Which rays: `data/datamodule.py`; how many: `conf/data/rays.yaml`; how often: `val_every_steps` in
+conf/trainer/auto.yaml.
+"""
 
 import math
 

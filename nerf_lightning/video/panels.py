@@ -1,4 +1,7 @@
-"""The panels of a film: what is shown of a rendered view, and how panels form a picture."""
+"""The panels of a film: what is shown of a rendered view, and how panels form a picture.
+
+Colors of depth and errors: `visualization/pictures.py`.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -1,4 +1,7 @@
-"""The settings of what `nerf render` films."""
+"""The settings of what `nerf render` films.
+
+The defaults: `conf/render.yaml`.
+"""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,7 @@
-"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the user."""
+"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the user.
+
+What is measured and filmed by default: `evaluation`, `path` and `final` in conf/train.yaml.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

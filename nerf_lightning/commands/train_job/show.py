@@ -37,7 +37,7 @@ from nerf_lightning.training.launch.lightning_flags import PROFILE
 
 ROWS = 15  # Of the profile: the slowest actions, including everything they called
 WIDTH = 54  # Characters of an action's name
-# The path of the film, in ten seconds.
+# The path that is played, in ten seconds; `nerf export` takes that of conf/export.yaml.
 PATH = {"num_frames": 120, "fps": 12}
 # Of photographs: with 16 of them, 92 steps reached 21.6 dB, and 1,018 steps 27.8.
 FEW_STEPS = 1_000

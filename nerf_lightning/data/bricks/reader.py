@@ -1,4 +1,7 @@
-"""The built-in scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
+"""The built-in scene: a fire engine of bricks and the cameras around it, rendered on first use and cached.
+
+The numbers of views and pixels: `conf/scene/bricks.yaml`. The fire engine: `parts.py`.
+"""
 
 import math
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,7 @@
-"""The area filter that shrinks photographs and masks by a whole factor."""
+"""The area filter that shrinks photographs and masks by a whole factor.
+
+The factor is chosen in `captures/reader.py`.
+"""
 
 import numpy as np
 from jaxtyping import Bool, UInt8

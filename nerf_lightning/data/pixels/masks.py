@@ -1,4 +1,7 @@
-"""Read which pixels of a photograph a mask keeps."""
+"""Read which pixels of a photograph a mask keeps.
+
+Where masks are looked for: `captures/mask_files.py`.
+"""
 
 from pathlib import Path
 from typing import Literal

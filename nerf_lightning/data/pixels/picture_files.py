@@ -1,4 +1,7 @@
-"""Read picture files as 8-bit RGBA with straight alpha, and depth maps."""
+"""Read picture files as 8-bit RGBA with straight alpha, and depth maps.
+
+Which formats are read: `formats.py`.
+"""
 
 import logging
 import math

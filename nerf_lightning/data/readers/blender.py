@@ -1,4 +1,7 @@
-"""The Blender format of the original method: `transforms_{train,val,test}.json` next to RGBA pictures."""
+"""The Blender format of the original method: `transforms_{train,val,test}.json` next to RGBA pictures.
+
+Near, far and the box: `conf/scene/blender.yaml`, too.
+"""
 
 from collections import Counter
 from collections.abc import Mapping

@@ -1,4 +1,7 @@
-"""COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, next to a folder of photographs."""
+"""COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, next to a folder of photographs.
+
+Which views are held out: `hold_every` in conf/scene_defaults.yaml. Camera models: `colmap_cameras.py`.
+"""
 
 import logging
 import os

@@ -1,6 +1,8 @@
 """The LLFF format: `poses_bounds.npy` next to folders of photographs (images, or shrunk ones such as images_4).
 
 Its bounds become near and far in `captures/frame_and_extent.py`.
+
+Which views are held out: `hold_every` in conf/scene_defaults.yaml.
 """
 
 import logging

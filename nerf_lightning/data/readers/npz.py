@@ -1,4 +1,7 @@
-"""The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a NumPy archive."""
+"""The one-file layout of the tiny Lego scene: `images`, `poses` and `focal` in a NumPy archive.
+
+Near, far, the box and the split: `conf/scene/npz.yaml` and `conf/scene/lego_tiny.yaml`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,6 +1,8 @@
 """Settings of structure from motion, the attempts in order, and the costs of its stages.
 
 How many frames are taken from a video, `video_frames.py` decides.
+
+`nerf poses` takes its settings from `conf/poses.yaml`, which repeats these defaults.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """The surface where the density crosses a level, as a mesh: closed, including the insides of objects.
 
 Marching cubes (Lewiner et al. 2003) are scikit-image's; floaters are removed.
+
+The level is `threshold` in conf/what/mesh.yaml, or else chosen by `surface.py`.
 """
 
 import logging

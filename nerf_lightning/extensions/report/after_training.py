@@ -1,4 +1,7 @@
-"""The report at the end of a training, which has checked its capture already."""
+"""The report at the end of a training, which has checked its capture already.
+
+Whether it is written: `final.report` in conf/train.yaml, or if that is auto, `config/auto_settings.py`.
+"""
 
 from pathlib import Path
 

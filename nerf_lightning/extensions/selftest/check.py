@@ -1,4 +1,7 @@
-"""A check computes something twice, and reports the difference and its bound."""
+"""A check computes something twice, and reports the difference and its bound.
+
+The bounds are in `kernels.py` and `training.py`.
+"""
 
 import logging
 import math

@@ -2,6 +2,8 @@
 
 They begin on surfaces instead of as a few points, and have a minute instead of an hour: rates are larger and decay
 faster, and transparent splats are replaced by splitting those that are too coarse by the gradient on the screen.
+
+How many splats: `fitted.py`. For how long: `seconds` in conf/what/page.yaml and conf/what/splats.yaml.
 """
 
 import math

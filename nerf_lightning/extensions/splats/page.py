@@ -1,4 +1,7 @@
-"""The scene as one page that anyone can open and explore: no server, no network, no program."""
+"""The scene as one page that anyone can open and explore: no server, no network, no program.
+
+`page_file.py` fills in the content; scripts and styles are in `page_files/`.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path

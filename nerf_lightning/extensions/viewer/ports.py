@@ -1,4 +1,7 @@
-"""The page's address and port: the requested port, or the next free one."""
+"""The page's address and port: the requested port, or the next free one.
+
+The port requested by default: `conf/view.yaml`, during training `conf/viewer/on.yaml`.
+"""
 
 import logging
 import os

@@ -1,4 +1,7 @@
-"""Photographs with different exposure and white balance."""
+"""Photographs with different exposure and white balance.
+
+When it is used: `conf/correction/auto.yaml`, by the doctor's check in `doctor/image_quality.py`.
+"""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,7 @@
-"""Sines and cosines of doubling frequencies: the positional encoding of the original NeRF."""
+"""Sines and cosines of doubling frequencies: the positional encoding of the original NeRF.
+
+The numbers of octaves, and `with_pi`, are in conf/encoder/frequency*.yaml.
+"""
 
 import math
 

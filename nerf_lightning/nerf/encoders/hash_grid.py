@@ -1,4 +1,8 @@
-"""Learned features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
+"""Learned features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989).
+
+Sizes: conf/encoder/hash_grid*.yaml, for model=auto `config/auto_settings.py`. Resolutions of levels:
+`kernels/hash_grid/layout.py`.
+"""
 
 import math
 

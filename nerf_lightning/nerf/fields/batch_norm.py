@@ -1,4 +1,7 @@
-"""Batch normalization (arXiv 1502.03167) with Keras's constants, an option of the article's network."""
+"""Batch normalization (arXiv 1502.03167) with Keras's constants, an option of the article's network.
+
+It is off by default: `batch_norm` in conf/field/nerf_mlp.yaml.
+"""
 
 import torch
 from jaxtyping import Float

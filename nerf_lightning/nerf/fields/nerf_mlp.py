@@ -1,4 +1,7 @@
-"""The MLP of the original NeRF (Fig. 7, arXiv 2003.08934)."""
+"""The MLP of the original NeRF (Fig. 7, arXiv 2003.08934).
+
+Depths and widths: `conf/field/nerf_mlp.yaml` and its variants. Octaves: `conf/encoder/`.
+"""
 
 from typing import Literal
 

@@ -1,4 +1,7 @@
-"""Two small MLPs on top of an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989)."""
+"""Two small MLPs on top of an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989).
+
+Widths and layers: `conf/field/ngp.yaml` and its variants. Density and color from raw outputs: `nerf/activations.py`.
+"""
 
 from itertools import pairwise
 from typing import Any

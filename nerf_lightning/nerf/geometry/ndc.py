@@ -2,6 +2,8 @@
 
 The frustum in front of the near plane z = -1 becomes the cube from -1 to 1: straight lines stay straight, the far end
 of the world becomes z = 1, and equal steps along a ray are equal steps of disparity.
+
+Which captures are modeled in them: `choose_space` in data/captures/frame_and_extent.py.
 """
 
 from dataclasses import replace

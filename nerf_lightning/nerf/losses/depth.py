@@ -1,4 +1,7 @@
-"""Depth supervision by sparse points: weights along a ray gather where structure from motion saw a surface."""
+"""Depth supervision by sparse points: weights along a ray gather where structure from motion saw a surface.
+
+Its weight and its share of rays: `conf/loss/depth.yaml`.
+"""
 
 from dataclasses import replace
 

@@ -1,6 +1,8 @@
 """The losses of mip-NeRF 360 (arXiv 2111.12077): color, proposals that bound the truth, and compact weights.
 
 Letters: edges t, weights w of the last level; edges u, weights v of a proposal.
+
+The weights of the terms: `conf/loss/proposal.yaml`.
 """
 
 import torch

@@ -2,6 +2,8 @@
 
 RobustNeRF (Sabour et al., 2023, arXiv 2302.00833): what the scene cannot explain has clustered large residuals, whereas
 fine detail has large residuals among small ones.
+
+The share that is kept: `conf/loss/robust.yaml`.
 """
 
 from dataclasses import replace

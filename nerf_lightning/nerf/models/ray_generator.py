@@ -4,6 +4,8 @@ Several rays may go through each pixel; their mean is what a photograph's pixel 
 through the center sees a point of that area. What is learned this way is blurred by a pixel, and differently from every
 side, so that other views are less sharp than the training views (Sec. 1, arXiv 2103.13415). The mean over a grid of
 rays is the simple cure; it multiplies the number of samples, so it is for the end of a run.
+
+How many rays, and from when on: `subpixels` in conf/model/, for model=auto `config/auto_settings.py`.
 """
 
 from collections.abc import Sequence

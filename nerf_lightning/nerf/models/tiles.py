@@ -1,4 +1,7 @@
-"""Tiles: a batch of rays goes through a model in parts, to limit memory."""
+"""Tiles: a batch of rays goes through a model in parts, to limit memory.
+
+Their size: `training/fastest_tile.py`, or what `compute/settings.py` takes without measuring.
+"""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,7 @@
-"""Parameter groups: tables do not decay, and parts may have their own learning rates."""
+"""Parameter groups: tables do not decay, and parts may have their own learning rates.
+
+The rates: `lr` in conf/optimizer/, `learning_rate` in conf/refinement/ and conf/correction/.
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -1,4 +1,7 @@
-"""Schedules: the learning rate as a function of only the step, so there is no state to lose."""
+"""Schedules: the learning rate as a function of only the step, so there is no state to lose.
+
+Which schedule with which numbers: `conf/scheduler/`, chosen by conf/train.yaml and conf/model/.
+"""
 
 from abc import ABC, abstractmethod
 

@@ -1,4 +1,7 @@
-"""Adam for sparse gradients: entries that a step did not touch are left alone (Sec. 4, arXiv 2201.05989)."""
+"""Adam for sparse gradients: entries that a step did not touch are left alone (Sec. 4, arXiv 2201.05989).
+
+Its numbers: `conf/optimizer/table_adam.yaml`. Groups of parameters: `groups.py`.
+"""
 
 import math
 from collections.abc import Callable, Iterable

@@ -1,4 +1,7 @@
-"""Small motions of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
+"""Small motions of cameras, one per photograph, and their focal lengths and lenses, one per camera.
+
+What is refined, how fast and from when on: `conf/refinement/`.
+"""
 
 from dataclasses import replace
 

@@ -1,6 +1,8 @@
 """The background, decided in one place: what is behind a ray, and what a photograph shows in front of it.
 
 A rendered ray is composited over it where its sums become a `Rendering` (`from_sums`, `from_light`).
+
+Which background a scene has, its reader decides: `default_background`, or `data/pixels/plain_background.py`.
 """
 
 from collections.abc import Callable

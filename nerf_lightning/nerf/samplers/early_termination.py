@@ -1,4 +1,7 @@
-"""Early termination: samples behind opaque ones (`sampler.opaque_below`) are neither counted nor given a color."""
+"""Early termination: samples behind opaque ones (`sampler.opaque_below`) are neither counted nor given a color.
+
+The number: `opaque_below` in conf/sampler/occupancy.yaml, or else OPAQUE_BELOW in `base.py`.
+"""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,7 @@
-"""Importance samples where the previous level saw something (Sec. 5.2, arXiv 2003.08934)."""
+"""Importance samples where the previous level saw something (Sec. 5.2, arXiv 2003.08934).
+
+How many: `conf/sampler/importance.yaml` and its variants.
+"""
 
 from dataclasses import replace
 

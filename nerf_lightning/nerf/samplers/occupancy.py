@@ -1,4 +1,7 @@
-"""An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989)."""
+"""An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989).
+
+Its numbers: `conf/sampler/occupancy.yaml` and its variants.
+"""
 
 import logging
 import math

@@ -1,6 +1,8 @@
 """When checkpoints are written: `last.ckpt` regularly and at the end, `best.ckpt` at the best validation.
 
 The preceding `last.ckpt` is kept as `previous.ckpt` (`checkpoints/writing.py` rotates them).
+
+How often: `conf/callbacks/default.yaml`.
 """
 
 from pathlib import Path

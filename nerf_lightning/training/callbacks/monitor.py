@@ -1,4 +1,7 @@
-"""Scalars for TensorBoard: losses, PSNR and gradients of each level, learning rate, speed, memory."""
+"""Scalars for TensorBoard: losses, PSNR and gradients of each level, learning rate, speed, memory.
+
+How often: `conf/callbacks/default.yaml`. Names of curves: `training/loggers.py`.
+"""
 
 import time
 from typing import Any

@@ -1,4 +1,7 @@
-"""The time of training, and how to train as well as a given one allows: the schedule ends with the time."""
+"""The time of training, and how to train as well as a given one allows: the schedule ends with the time.
+
+The time itself: `budget.seconds` in conf/train.yaml, if that is auto `config/auto_settings.py`.
+"""
 
 import math
 import signal
