@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from nerf_lightning.config.help.catalogue import command_named, known_names
-from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.suggestions import did_you_mean
 
 PATH_KEY = re.compile(r"[+]*([\w.]+\.)?(root|images|video|checkpoint|ckpt|run|resume|init_from|\w+_(dir|file))")
 OF_HYDRA = re.compile(r"""(['"]).*\1|\[.*\]|\{.*\}|.*(\$\{|\\[][(){}:=,\s]).*""")

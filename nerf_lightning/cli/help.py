@@ -13,9 +13,9 @@ from nerf_lightning.config.help.candidates import SHELLS, candidates
 from nerf_lightning.config.help.catalogue import Command, command_named, known_names
 from nerf_lightning.config.help.pages import command_page, page_of
 from nerf_lightning.config.help.search import search
-from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import terminal_width
+from nerf_lightning.messages.suggestions import did_you_mean
 
 FLAGS = ("-h", "--help")
 WIDEST = 120

@@ -24,12 +24,12 @@ from nerf_lightning.cli.process import (
     was_interrupted,
 )
 from nerf_lightning.config.help.catalogue import command_named
-from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal, terminal_width
 from nerf_lightning.messages.exit_codes import BAD_INPUT, INTERRUPTED
+from nerf_lightning.messages.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -13,12 +13,12 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.config.help.catalogue import Command, command_named, known_names
-from nerf_lightning.config.help.suggestions import did_you_mean, near
 from nerf_lightning.config.overrides import PLAIN, to_type
 from nerf_lightning.config.setting_rules import LIGHTNING_ARGUMENTS
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
+from nerf_lightning.messages.suggestions import did_you_mean, near
 
 ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")

@@ -12,11 +12,11 @@ from omegaconf import DictConfig
 from nerf_lightning.compute.compile_kernels import compile_kernels
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.error_messages import in_words
-from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import SWITCH, flatten, quoted
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.suggestions import did_you_mean
 from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS
 
 NO_EXPORTERS = ("evaluate", "video")

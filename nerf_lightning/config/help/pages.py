@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from textwrap import fill
 
 from nerf_lightning.config.help.catalogue import Command, Option, Setting
-from nerf_lightning.config.help.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.suggestions import did_you_mean
 
 COLUMN = 34  # Start of the sentences in a list
 PLACEHOLDER = re.compile(r"^\$(GROUPS|SETTINGS):(.*)$", re.MULTILINE)

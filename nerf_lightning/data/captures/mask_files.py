@@ -1,4 +1,7 @@
-"""Match masks to photographs: by the capture's files, by scene.masks, or by a folder called masks."""
+"""Match masks to photographs: by the capture's files, by scene.masks, or by a folder called masks.
+
+How a mask's name follows from its photograph's: `named_picture` in `find_pictures.py`.
+"""
 
 import logging
 from collections.abc import Sequence

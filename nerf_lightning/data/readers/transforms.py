@@ -1,6 +1,7 @@
 """`transforms.json` in the flavors of nerfstudio and instant-ngp: poses, intrinsics, lenses, masks, splits.
 
-Without splits, `hold_every` in conf/scene_defaults.yaml holds views out. A frame's keys: `json_frames.py`.
+Without splits, `hold_every` in conf/scene_defaults.yaml holds views out. Intrinsics, lens
+models (`camera_model`, `k1`, ...) and keys of frames: `json_frames.py`.
 """
 
 import logging

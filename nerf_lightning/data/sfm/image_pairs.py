@@ -1,4 +1,7 @@
-"""Choose which photographs are compared with each other."""
+"""Choose which photographs are compared with each other.
+
+That a film's frames are matched in sequence is decided in `find_poses.py`.
+"""
 
 from itertools import combinations, groupby
 from typing import Literal

@@ -2,6 +2,8 @@
 
 The method is COLMAP's (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT features, matching
 and verification of pairs, incremental registration of photographs, bundle adjustment.
+
+What is said if photographs are left out, and from how many on: `remarks` and ENOUGH in `find_poses.py`.
 """
 
 from collections import Counter

@@ -1,4 +1,7 @@
-"""Requests of the page's users to the training: pause, resume, stop."""
+"""Requests of the page's users to the training: pause, resume, stop.
+
+When training obeys them, after each step: `live_view.py`.
+"""
 
 import time
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""The contraction of all space into a ball (Sec. 5, arXiv 2111.12077), and the matching spacing of samples."""
+"""The contraction of all space into a ball (Sec. 5, arXiv 2111.12077), and the matching spacing of samples.
+
+Kernels repeat both: `kernels/render/dense.py` and `cuda.py`, `kernels/histograms/cpu.py` and `cuda.py`.
+"""
 
 from typing import Any
 

@@ -4,7 +4,6 @@ None that pass through change what is learned: they control what is measured, sh
 is the same run.
 """
 
-import difflib
 import inspect
 import logging
 import warnings
@@ -21,6 +20,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from nerf_lightning.config.instantiate import require_fitting
 from nerf_lightning.config.setting_rules import LIGHTNING_ARGUMENTS
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.suggestions import did_you_mean
 
 DEFAULTS: dict[str, Any] = {"num_sanity_val_steps": 0, "enable_model_summary": False, "log_every_n_steps": 1}
 """Our defaults, where they differ from Lightning's."""
@@ -86,8 +86,7 @@ def written_to(folder: Path, flags: dict[str, Any]) -> dict[str, Any]:
 
 def _near(name: str) -> str:
     offered = sorted(set(inspect.signature(Trainer).parameters) - LIGHTNING_ARGUMENTS.keys())
-    close = difflib.get_close_matches(name, [*offered, *LIGHTNING_ARGUMENTS], n=3)
-    return f"Did you mean {' or '.join(close)}?" if close else f"It has {', '.join(offered)}."
+    return did_you_mean(name, [*offered, *LIGHTNING_ARGUMENTS]).strip() or f"It has {', '.join(offered)}."
 
 
 @contextmanager

@@ -1,12 +1,12 @@
 """A smooth path through chosen photographs of the capture."""
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import final
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.suggestions import near
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame
 from nerf_lightning.video.paths.spline import even_speed, frame_times, poses_along
@@ -54,10 +54,10 @@ def find_views(chosen: Sequence[str | int], names: Sequence[str], count: int) ->
             exact = [number for number, name in enumerate(names) if name == str(each)]
             numbers = exact or [number for number, name in enumerate(names) if fnmatchcase(name, str(each))]
         if not numbers:
-            near = difflib.get_close_matches(str(each), names, n=3) or list(names[:3])
+            similar = near(str(each), names) or list(names[:3])
             raise InputError(
                 f"path.views: the capture has no photograph {each}. It has {count}, numbered from 0"
-                + (f", with names like {', '.join(near)}." if near else ".")
+                + (f", with names like {', '.join(similar)}." if similar else ".")
             )
         found += numbers
     return found
