@@ -61,7 +61,7 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
 
 @pytest.mark.slow
 def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
-    long = ("trainer.max_steps=1000000", "budget.seconds=1", "scheduler.cooldown=1.0")
+    long = ("trainer.max_steps=1000000", "budget.seconds=2", "scheduler.cooldown=1.0")
     output = output_of(start(*arguments(capture, tmp_path / "run", *long)))
     content = saved(tmp_path / "run")
     assert 0 < content["global_step"] < 100_000  # a busy machine that compiles kernels on the way has few
@@ -70,6 +70,6 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     assert rate["lr"] / rate["base_lr"] < 0.02 + 3 / content["global_step"]
     used = [state["used"] for state in content["callbacks"].values() if "used" in state]
     assert used
-    assert used[0] >= 0.75
-    assert "training: 1 s (budget.seconds), " in output
+    assert used[0] >= 1.75
+    assert "training: 2 s (budget.seconds), " in output
     assert f"{content['global_step']} steps in " in output
