@@ -49,7 +49,7 @@ site_pages.write()
 
 
 BOLD = re.compile(r'<mi mathvariant="bold">([A-Za-z])</mi>')
-HAT = re.compile(r'<mover accent="true"><mi>([A-Za-z\U0001D400-\U0001D433])</mi><mo>&#x0005E;</mo></mover>')
+HAT = re.compile(r'<mover accent="true">(?:<mrow>)?<mi( mathvariant="bold")?>C</mi>(?:</mrow>)?<mo>&#x0005E;</mo></mover>')
 BRACKET = re.compile('<mo stretchy="[^>]*>')
 
 
@@ -63,14 +63,11 @@ def mathml(formula, display="inline"):
         first, offset = (0x1D400, ord("A")) if letter[1].isupper() else (0x1D41A, ord("a"))
         return f"<mi>{chr(first + ord(letter[1]) - offset)}</mi>"
 
-    def hat(mover):
-        letter = mover[1]
-        if letter.isascii():
-            letter = chr((0x1D434 if letter.isupper() else 0x1D44E) + ord(letter.upper()) - ord("A"))
-        return f"<mi>{letter}\u0302</mi>"
+    def hat(mover):  # one letter with its hat, which stands where it should
+        return f'<mi style="font-{"weight: bold" if mover[1] else "style: italic"}">\u0108</mi>'
 
     converted = BRACKET.sub('<mo stretchy="false" lspace="0" rspace="0">', convert(formula, display=display))
-    return HAT.sub(hat, BOLD.sub(bold, converted))
+    return BOLD.sub(bold, HAT.sub(hat, converted))
 
 
 def inline_math(page, node):

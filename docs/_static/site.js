@@ -26,6 +26,19 @@ const UNIT = /(\d) (?=(dB|s|ms|min|h|GB|MB|kB|%)(?!\w))/g;
 const words = document.createTreeWalker(document.querySelector("article"), NodeFilter.SHOW_TEXT);
 while (words.nextNode()) if (!words.currentNode.parentElement.closest("pre, code")) words.currentNode.data = words.currentNode.data.replace(UNIT, "$1\u00a0");
 
+// Each line of code is an element of its own, and what wraps of it is indented further; parts that span lines are split.
+for (const pre of document.querySelectorAll(".highlight pre")) {
+  const open = [];
+  const split = pre.innerHTML.replace(/<span[^>]*>|<\/span>|\n/g, tag => {
+    if (tag === "\n") return "</span>".repeat(open.length) + "\n" + open.join("");
+    if (tag === "</span>") open.pop();
+    else open.push(tag);
+    return tag;
+  });
+  pre.innerHTML = split.replace(/\n$/, "").split("\n").map(line => `<span class="of-code">${line}</span>`).join("");
+  for (const line of pre.children) line.style.setProperty("--indent", `${line.textContent.match(/^ */)[0].length}ch`);
+}
+
 for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
   code.classList.toggle("short", code.matches(".literal") && code.textContent.length <= LONG.td);
   const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [], long = LONG[code.closest("td") ? "td" : ""];
@@ -42,7 +55,9 @@ for (const table of tables) {
   for (const row of table.querySelectorAll("tbody tr")) {
     above = row.cells[0].textContent.trim() || above;
     [...row.cells].forEach((cell, column) => {
-      cell.classList.toggle("blank", !cell.textContent.trim() && !cell.querySelector("img"));
+      const blank = !cell.textContent.trim() && !cell.querySelector("img");
+      cell.classList.toggle("blank", blank);
+      if (blank && column) cell.innerHTML = "<p>\u2013</p>";
       if (!column && cell.matches(".blank") && above) cell.dataset.above = above;
       if ((!column && !NUMBER.test(cell.textContent.trim())) || names.length < LABELED || !names[column]) return;
       cell.dataset.column = names[column];

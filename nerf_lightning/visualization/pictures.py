@@ -26,6 +26,7 @@ LONGEST_PANEL = 1600
 photographs would be larger than any display."""
 
 PAPER = 255
+DARK, LIGHT = 24, (225, 225, 225)
 _INK = (64, 64, 64)
 _BACKDROP = 0.93  # Gray where no ray hits: no color of the map is gray, so it reads as neither near nor far.
 
@@ -222,21 +223,23 @@ def _with_scale(
     if not inside:
         return torch.cat([picture, _scale(picture.shape[0], size, top, bottom)], dim=1)
     margin = (0, 0, 0, 0, size // 3, size // 3)
-    scale = torch.nn.functional.pad(_scale(4 * size, size, top, bottom), margin, value=PAPER)
+    scale = torch.nn.functional.pad(_scale(4 * size, size, top, bottom, DARK, LIGHT), margin, value=DARK)
     if scale.shape[0] <= picture.shape[0] // 2 and scale.shape[1] <= picture.shape[1] // 2:
         picture[: scale.shape[0], -scale.shape[1] :] = scale
     return picture
 
 
-def _scale(height: int, size: int, top: str, bottom: str) -> UInt8[Tensor, "height width 3"]:
+def _scale(
+    height: int, size: int, top: str, bottom: str, paper: int = PAPER, ink: tuple[int, int, int] = _INK
+) -> UInt8[Tensor, "height width 3"]:
     font = ImageFont.load_default(size)
     thick, space = max(4, size // 2), max(3, size // 3)
     longest = max(round(font.getlength(text) + 0.5) for text in (top, bottom))
-    page = Image.new("RGB", (3 * space + thick + longest, height), (PAPER,) * 3)
+    page = Image.new("RGB", (3 * space + thick + longest, height), (paper,) * 3)
     ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
     page.paste(Image.fromarray(to_bytes(ramp).numpy()), (space, 0))
     draw, left = ImageDraw.Draw(page), 2 * space + thick
     # Round digits reach beyond their lines.
-    draw.text((left, 1), top, fill=_INK, font=font, anchor="lt")
-    draw.text((left, height - 2), bottom, fill=_INK, font=font, anchor="ls")
+    draw.text((left, 1), top, fill=ink, font=font, anchor="lt")
+    draw.text((left, height - 2), bottom, fill=ink, font=font, anchor="ls")
     return torch.from_numpy(np.array(page))

@@ -46,7 +46,8 @@ CHARTS = (
         re.compile(r"Training loss/(\w{1,40})"),
         is_logarithmic=True,
         is_noisy=True,
-        note="The weighted terms of the loss, their sum over each level of the model, and the sum of all.",
+        note="Weighted terms (color: its error; distortion, interlevel: shape of the weights along rays), their sums "
+        "over each level of the model, and the sum of all.",
     ),
     Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
     Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True, from_zero=True),

@@ -16,11 +16,9 @@ from nerf_lightning.files.made_folders import child_of
 from nerf_lightning.messages.errors import InputError
 
 ROWS = {
-    ("protocol", "scene"): "scene's name",
-    ("origin", "scene"): "scene=",
     ("protocol", "split"): "views",
     ("protocol", "split_hash"): "fingerprint of these views",
-    ("protocol", "pixels"): "colors of the render",
+    ("protocol", "pixels"): "renders rounded to 8 bits",
     ("protocol", "colors"): "colors fitted before scoring",
     ("protocol", "masks"): "masked pixels",
     ("protocol", "downscale"): "photographs shrunk by",
@@ -34,8 +32,8 @@ ROWS = {
 }
 """Labels of rows of the tables, by table and key."""
 WORDS = {
-    ("pixels", "float"): "not rounded",
-    ("pixels", "8-bit"): "rounded to 8 bits",
+    ("pixels", "float"): "no",
+    ("pixels", "8-bit"): "yes",
     ("cameras", "raw"): "as given",
     ("cameras", "refined"): "refined in training",
     ("colors", "raw"): "no",
@@ -66,6 +64,9 @@ def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
         key: [(ROWS.get((key, name), _name(name))[:80], _said(name, value)) for name, value in found]
         for key, found in told.items()
     }
+    if ("scene", origin := dict(pairs["origin"]).get("scene")) in pairs["protocol"]:  # a capture without a name
+        pairs["protocol"] = [("format" if key == "scene" else key, text) for key, text in pairs["protocol"]]
+        pairs["origin"].remove(("scene", origin))
     if pairs["protocol"] and metrics.get("lpips") is None:
         pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "LPIPS"), ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]

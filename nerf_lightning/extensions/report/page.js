@@ -111,7 +111,7 @@ function draw(figure, chart) {
   let low = all[Math.floor(0.005 * all.length)], high = all[Math.ceil(0.995 * all.length) - 1];
   const margin = 0.05 * (high - low) || 0.05 * Math.abs(high) || 1;
   low -= margin; high += margin;
-  if (chart.from_zero) low = 0;
+  if (chart.from_zero) { low = 0; high *= 1.05; }
   const x = step => LEFT + (step - first) / (last - first) * (width - LEFT - RIGHT);
   const y = value => TOP + (high - Math.min(high, Math.max(low, value))) / (high - low) * (HEIGHT - TOP - BOTTOM);
 
@@ -147,7 +147,8 @@ function draw(figure, chart) {
   };
   const legend = () => {
     cursor.setAttribute("visibility", "hidden");
-    say(curves.length > 1 ? curves.map(({label}, number) => [label, COLORS[number % COLORS.length]]) : []);
+    say(curves.length > 1 ? curves.map(({label}, number) => [label, COLORS[number % COLORS.length]])
+      : [[`last: ${short([curves[0].values.at(-1)])[0]}`, ""]]);
   };
   const nearest = (steps, step) => steps.reduce((best, each, k) =>
     Math.abs(each - step) < Math.abs(steps[best] - step) ? k : best, 0);

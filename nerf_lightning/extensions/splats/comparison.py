@@ -30,9 +30,9 @@ class Comparison:
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the metrics of splats and field in one row each, with its label."""
-        rows = [("quality", self.splats, f" on {self.views}")]
+        rows = [("quality", self.splats, f" on {self.views} without lens distortion")]
         if self.field is not None:
-            rows.append(("quality of the model", self.field, " on the same views, both without lens distortion"))
+            rows.append(("the model's, for comparison", self.field, "; its report keeps the distortion"))
         return [(label, f"PSNR {row['psnr']:.2f} dB{_ssim(row)}{how}") for label, row, how in rows]
 
     def psnr(self) -> str:

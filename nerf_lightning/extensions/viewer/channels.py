@@ -40,8 +40,9 @@ def depth_scale(view: View, record: SceneRecord) -> str:
     bright_to_dark = to_bytes(color_map(torch.linspace(1, 0, 9)[None], 0.0, 1.0))[0].tolist()
     colors = ", ".join(f"rgb({r} {g} {b})" for r, g, b in bright_to_dark)
     ramp = f'<i style="flex:1;height:10px;border-radius:2px;background:linear-gradient(to right, {colors})"></i>'
+    said = " In the capture's units." if record.metres_per_unit is None else ""
     line = f'<div style="display:flex;gap:8px;align-items:center">near {near} {ramp} far {far}</div>'
-    return f'<div style="padding:0 1em 0.5em;font-size:0.85em">{line}Gray: no surface</div>'
+    return f'<div style="padding:0 1em 0.5em;font-size:0.85em">{line}Gray: no surface.{said}</div>'
 
 
 def _depth(view: View) -> Float[Tensor, "height width 3"]:

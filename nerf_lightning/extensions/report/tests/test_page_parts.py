@@ -111,7 +111,7 @@ def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():
     found = tables({"origin": origin, "protocol": {"psnr": "mean of the pictures' own"}})
     assert [text for _, text in dict(found)["Provenance"]] == ["12,525,764", "50.1", "0", "False"]
     plain = dict(tables({"protocol": {"pixels": "float", "cameras": "raw", "hold_every": "8"}}))["Protocol"]
-    assert plain[:2] == [("colors of the render", "not rounded"), ("cameras", "as given")]
+    assert plain[:2] == [("renders rounded to 8 bits", "no"), ("cameras", "as given")]
     assert ("PSNR", "mean over the pictures") in dict(found)["Protocol"]
     columns, rows = per_image({"per_image": [{"name": "a", "psnr": 28.5, "cc_psnr": 29}]})
     assert (columns, rows) == (["name", "PSNR", "PSNR with fitted colors"], [["a", "28.50 dB", "29.00 dB"]])

@@ -51,11 +51,13 @@ function shownPart() {
   return { top: above, width: innerWidth, height: Math.max(1, innerHeight - above - below) };
 }
 
+const BESIDE = 8;  // pixels on either side of a photograph's frame
+
 // Focal length and principal point of a view's lens, whose picture fits into that part of the window, in `ratio` pixels
 // to one of CSS.
 function lensIn({ lens }, ratio = 1) {
   const { top, width, height } = shownPart(), middle = [ratio * width / 2, ratio * (top + height / 2)];
-  const scale = ratio * Math.min(width / lens.width, height / lens.height);
+  const scale = ratio * Math.min((width - 2 * BESIDE) / lens.width, height / lens.height);
   const center = middle.map((at, i) => at + scale * (lens.center[i] - [lens.width, lens.height][i] / 2));
   return { scale, center, focal: lens.focal.map((pixels) => scale * pixels) };
 }
