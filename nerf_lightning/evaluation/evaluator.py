@@ -1,6 +1,7 @@
 """Measure a model on the views of a split: metrics per picture, their summary, and the protocol of the measurement.
 
-Formulas, and means over pictures: `metrics.py`. `conf/evaluation/default.yaml` has the defaults; `conf/train.yaml` changes them for the end of training.
+Formulas, and means over pictures: `metrics.py`. `conf/evaluation/default.yaml` has the defaults; `conf/train.yaml`
+changes them for the end of training.
 """
 
 import logging
