@@ -1,4 +1,7 @@
-"""Split a command line into Hydra's own options, parsed by Hydra, and settings; quote paths for Hydra."""
+"""Split a command line into Hydra's own options, parsed by Hydra, and settings; quote paths for Hydra.
+
+Which setting takes a path without a key: PATH_SETTINGS in `config/help/catalogue.py`.
+"""
 
 import os
 import re

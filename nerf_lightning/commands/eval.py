@@ -1,6 +1,7 @@
 """Evaluate a checkpoint: PSNR, SSIM, LPIPS, and errors of depth and normals if ground truth is known.
 
-What is measured by default: `conf/evaluation/default.yaml`; how: `evaluation/`.
+What is measured by default: `conf/evaluation/default.yaml`; how: `evaluation/`; the lines it prints:
+`evaluation/main_numbers.py`.
 """
 
 import torch
@@ -8,7 +9,8 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import as_known, open_checkpoint
-from nerf_lightning.evaluation.protocol import measured_of, metric_lines
+from nerf_lightning.evaluation.main_numbers import metric_lines
+from nerf_lightning.evaluation.protocol import measured_of
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.command_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes

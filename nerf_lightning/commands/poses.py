@@ -1,6 +1,7 @@
 """Find the cameras of photographs or of a video by structure from motion.
 
 The output is a folder that `scene=colmap` reads.
+Its summary: `summary_lines` in `data/sfm/find_poses.py`.
 """
 
 import time

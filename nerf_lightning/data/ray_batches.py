@@ -2,6 +2,9 @@
 
 The order of rays is a permutation of all training pixels, new in each epoch and computed one batch at a time; only the
 number of rays seen is stored, so a resumed run continues exactly where it stopped.
+
+How many rays: `batch_rays` in conf/data/rays.yaml and conf/model/, adapted to `sample_budget` in one of the sizes of
+`nerf/types/progress.py`. `kernels/pixels/cpu.py` and `cuda.py` gather the same pixels.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,7 @@
-"""Match places of different photographs by their pixels alone, and collect proofs."""
+"""Match places of different photographs by their pixels alone, and collect proofs.
+
+When two corners match: `match` and RATIO in `features.py`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -2,6 +2,8 @@
 
 Without them, few photographs do not determine where things are: with 14 photographs of a cup, 600 steps reach 16 dB,
 and 25 dB with them (docs/measurements.md). Held-out photographs are not used.
+
+Which runs take them: `takes_distances` in `config/auto_settings.py`.
 """
 
 import logging

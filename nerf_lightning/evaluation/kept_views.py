@@ -1,6 +1,7 @@
 """Keep the pictures of some scored views, evenly spaced, and of the worst.
 
 How many: `num_pictures` and `num_worst` in conf/evaluation/default.yaml.
+Their colors of depth and errors: `visualization/pictures.py`.
 """
 
 import io

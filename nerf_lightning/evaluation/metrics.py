@@ -1,6 +1,7 @@
 """How close a render is to a photograph: PSNR and SSIM of one image, and their mean over images.
 
 Papers average the PSNR of each image. Pooling the squared error over images first gives a lower number.
+The equation of the PSNR, and its maximum: `nerf/psnr.py`.
 """
 
 import statistics

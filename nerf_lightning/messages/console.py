@@ -1,4 +1,7 @@
-"""Terminal output: lines on stdout, progress bars on stderr; `conf/hydra/nerf.yaml` has the look of log lines."""
+"""Terminal output: lines on stdout, progress bars on stderr; `conf/hydra/nerf.yaml` has the look of log lines.
+
+Which warnings of Lightning are hidden: `_quiet_libraries` in `compute/devices.py`.
+"""
 
 import logging
 import sys

@@ -1,6 +1,7 @@
 """The one error that is addressed to the user: bad input, explained in one paragraph with its cure.
 
 Errors of Hydra, of full memory and of GPUs are put into words in `config/error_messages.py`.
+Their line in the terminal: `_complain` in `cli/main.py`.
 """
 
 from collections.abc import Iterable

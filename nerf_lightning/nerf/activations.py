@@ -1,4 +1,8 @@
-"""From a network's raw outputs to density and color; whole-ray kernels compute the same, with these constants."""
+"""From a network's raw outputs to density and color.
+
+Kernels compute the same, with these constants: `kernels/render/cpu.py`, `compositing.py` and `cuda.py`, and
+`kernels/field/cuda.py`.
+"""
 
 from typing import Any
 

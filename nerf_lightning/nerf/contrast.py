@@ -6,6 +6,7 @@ importance sampling, Talbot et al. 2005, "Importance Resampling for Global Illum
 so every device chooses the same pixels.
 
 How many candidates: `candidates` in conf/data/rays.yaml and in conf/model/.
+`kernels/pixels/cpu.py` computes the same contrast.
 """
 
 import torch

@@ -4,6 +4,7 @@ A uniform number is a function of (seed, attempt, step, purpose, ray slot in the
 ranks and devices slice the same numbers, and a resumed run draws what an uninterrupted one would have drawn.
 Words are non-negative 32-bit integers kept in int64, and each multiplier is below 2^31, so no product overflows
 and every device agrees.
+`kernels/random/cpu.py` and `cuda.py` compute the same, `kernels/pixels/` the same permutation.
 """
 
 import zlib

@@ -1,4 +1,7 @@
-"""Output folders of commands that do not train: the user's choice, or next to the checkpoint."""
+"""Output folders of commands that do not train: the user's choice, or next to the checkpoint.
+
+The default folder's name is in the command's own file, in `commands/`.
+"""
 
 import tempfile
 from collections.abc import Iterator

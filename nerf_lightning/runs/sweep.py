@@ -1,4 +1,7 @@
-"""A sweep in its own process: the command to resume it, the jobs' cores, Ctrl-C, and the table at its end."""
+"""A sweep in its own process: the command to resume it, the jobs' cores, Ctrl-C, and the table at its end.
+
+The name of its folder: `conf/hydra/nerf.yaml`.
+"""
 
 import logging
 import math

@@ -1,4 +1,7 @@
-"""The columns of a table: how many decimals each has, and how its values are shown."""
+"""The columns of a table: how many decimals each has, and how its values are shown.
+
+Which columns there are: `job_rows` in `sweep.py`, and `extensions/table/rows.py`.
+"""
 
 import re
 from typing import Any

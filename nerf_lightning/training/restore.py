@@ -1,6 +1,7 @@
 """What a checkpoint keeps of a run, what a resume restores, and what is checked first.
 
 Lightning restores weights, optimizer, callbacks and loops; `restore_run` restores the rest.
+`init_from`, which takes only the weights, is read in `runs/plan_run.py`.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -1,4 +1,7 @@
-"""Film models along a camera path: color, depth and more, as videos or frames, if a frame fits into memory."""
+"""Film models along a camera path: color, depth and more, as videos or frames, if a frame fits into memory.
+
+Names of films: FILMS in `panels.py`; their endings: FILES in `settings.py`.
+"""
 
 import hashlib
 import json

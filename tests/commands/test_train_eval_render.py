@@ -12,7 +12,7 @@ from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-from nerf_lightning.evaluation.protocol import metric_lines
+from nerf_lightning.evaluation.main_numbers import metric_lines
 
 
 def events(folder):

@@ -1,6 +1,7 @@
 """The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the user.
 
 What is measured and filmed by default: `evaluation`, `path` and `final` in conf/train.yaml.
+The result in a sentence, and what would improve it: `show.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +19,8 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.data.pixels.picture_files import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.evaluation.protocol import measured_of, metric_lines
+from nerf_lightning.evaluation.main_numbers import metric_lines
+from nerf_lightning.evaluation.protocol import measured_of
 from nerf_lightning.export.base import Export
 from nerf_lightning.messages.console import say
 from nerf_lightning.nerf.models.base import Model, point_field, show_photographs

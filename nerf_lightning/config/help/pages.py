@@ -1,4 +1,7 @@
-"""Pages of `nerf help`: a command, a group, one of its options, a section of settings, or one setting."""
+"""Pages of `nerf help`: a command, a group, one of its options, a section of settings, or one setting.
+
+Which settings and groups a command's page lists: `hydra.help.template` in its YAML.
+"""
 
 import re
 from collections.abc import Iterator

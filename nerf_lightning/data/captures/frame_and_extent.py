@@ -1,4 +1,7 @@
-"""The space that is modeled, the working frame of a capture, and the extent of content along its rays."""
+"""The space that is modeled, the working frame of a capture, and the extent of content along its rays.
+
+Up, middle and unit: `nerf/geometry/world_frame.py`.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal

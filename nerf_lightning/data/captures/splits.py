@@ -1,4 +1,7 @@
-"""Split views into training views and held-out views: every Nth, by `hold_every` in conf/scene_defaults.yaml."""
+"""Split views into training views and held-out views: every Nth, by `hold_every` in conf/scene_defaults.yaml.
+
+Which split stands in for a missing val or test: `CaptureReader._splits` in `reader.py`.
+"""
 
 import logging
 from collections.abc import Callable, Hashable, Sequence

@@ -1,4 +1,7 @@
-"""Formats of picture files: the decoders that may be used, and what to do about formats that none of them reads."""
+"""Formats of picture files: the decoders that may be used, and what to do about formats that none of them reads.
+
+Endings of pictures that are read: ENDINGS in `picture_files.py`.
+"""
 
 from functools import cache
 from importlib import import_module

@@ -2,6 +2,8 @@
 
 They are parsed here: COLMAP's own library hangs on some truncated ones. The caller catches what damaged files raise
 (`files.trust.reading`).
+
+How far a point's distance is trusted: `captures/known_depths.py`.
 """
 
 import logging

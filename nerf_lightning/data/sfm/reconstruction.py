@@ -4,6 +4,7 @@ The method is COLMAP's (Schönberger and Frahm, "Structure-from-Motion Revisited
 and verification of pairs, incremental registration of photographs, bundle adjustment.
 
 What is said if photographs are left out, and from how many on: `remarks` and ENOUGH in `find_poses.py`.
+How many features, and which mapper: `attempts` in `settings.py`.
 """
 
 from collections import Counter

@@ -1,4 +1,7 @@
-"""The coverage map of a page: from which directions the scene was seen. The page writes its labels as text."""
+"""The coverage map of a page: from which directions the scene was seen. The page writes its labels as text.
+
+What counts as seen: NEAR_ENOUGH in `visualization/camera_layout.py`.
+"""
 
 from typing import NamedTuple
 

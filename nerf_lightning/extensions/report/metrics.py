@@ -1,6 +1,7 @@
 """What `metrics.json` holds, as a page shows it, in the columns of `evaluation/metrics_files.py`.
 
 The file may be anybody's: what does not fit is left out.
+The main numbers: `evaluation/main_numbers.py`.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """A check computes something twice, and reports the difference and its bound.
 
-The bounds are in `kernels.py` and `training.py`.
+Which check has which bound: `kernels.py` and `training.py`. Bounds of rounding: `value_bound` and `gradient_bound`.
 """
 
 import logging

@@ -3,6 +3,8 @@
 Letters: `mean` m and `covariance` S of a Gaussian in the world, W the world-to-camera rotation (rows right, down,
 forward), (x, y, z) the mean in camera axes, J the Jacobian of the perspective (x fx / z, y fy / z) there, `conic` the
 inverse of the covariance on the screen, in 1 / pixels^2.
+
+The page repeats projection and thresholds: `page_files/splats.vert`, `splats.frag` and `splats.js`.
 """
 
 import math

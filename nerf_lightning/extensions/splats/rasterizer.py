@@ -2,6 +2,7 @@
 
 The result is deterministic: tiles are distributed over threads, and their gradients of a splat are added in a fixed
 order.
+Which contributions are too faint: `gaussians.py`.
 """
 
 from typing import Any

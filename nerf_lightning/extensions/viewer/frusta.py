@@ -1,4 +1,7 @@
-"""Draw over the picture: the cameras of the photographs, the crop box, and the camera path."""
+"""Draw over the picture: the cameras of the photographs, the crop box, and the camera path.
+
+Which photographs have a frustum: `frustum_views` in `shown_photographs.py`.
+"""
 
 import math
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """One user's picture: coarse at once, then progressively finer while the request is unchanged.
 
-How coarse, `Renderer.height_while_moving` decides (renderer.py).
+How coarse: `SlicedRenderer.height_while_moving` in `renderer.py`. The quality of its JPEG: QUALITY in `client.py`.
 """
 
 from collections.abc import Callable, Generator

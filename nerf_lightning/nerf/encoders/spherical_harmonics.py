@@ -1,4 +1,8 @@
-"""Real spherical harmonics of a direction: a few smooth functions on the sphere."""
+"""Real spherical harmonics of a direction: a few smooth functions on the sphere.
+
+`kernels/spherical_harmonics/cuda.py` repeats the formulas, for splats `extensions/splats/projection.py` and
+`page_files/splats.vert` there.
+"""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""Axis-aligned boxes."""
+"""Axis-aligned boxes; `kernels/march/cuda.py` repeats `distances_in_box`."""
 
 import torch
 from jaxtyping import Float

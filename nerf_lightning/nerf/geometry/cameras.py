@@ -2,6 +2,8 @@
 
 Letters: `c2w` camera-to-world, columns right, up, back, center. A camera looks along -z; pixel centers lie at +0.5.
 `plane` is a position in the image in focal lengths from the principal point, y down: ((x - cx) / fx, (y - cy) / fy).
+
+`kernels/rays/cuda.py` repeats `rays_through_pixels`.
 """
 
 import math

@@ -5,6 +5,8 @@ calib3d and fisheye). `plane` is a position in the image in focal lengths from t
 (distorted). The six coefficients of `lens` are k1, k2, k3, k4, p1, p2; note that OpenCV lists the radial and tangential
 ones as k1, k2, p1, p2, k3. Sources: Brown, "Close-range camera calibration", 1971; Kannala and Brandt, "A generic
 camera model and calibration method", 2006.
+
+`kernels/lenses/cpu.py` and `kernels/rays/cuda.py` repeat the iteration.
 """
 
 import torch

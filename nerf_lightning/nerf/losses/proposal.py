@@ -3,6 +3,7 @@
 Letters: edges t, weights w of the last level; edges u, weights v of a proposal.
 
 The weights of the terms: `conf/loss/proposal.yaml`.
+`kernels/histograms/cpu.py` and `cuda.py` repeat the last two.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""Whole views: render every pixel of a camera, a chunk of rays at a time."""
+"""Whole views: render every pixel of a camera, a chunk of rays at a time; how many, `tiles.py` computes."""
 
 import logging
 from collections.abc import Callable

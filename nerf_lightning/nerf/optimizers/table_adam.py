@@ -1,6 +1,7 @@
 """Adam for sparse gradients: entries that a step did not touch are left alone (Sec. 4, arXiv 2201.05989).
 
 Its numbers: `conf/optimizer/table_adam.yaml`. Groups of parameters: `groups.py`.
+The equations: `adam_step_torch` in `kernels/table_adam/op.py`, repeated in `cpu.py` and `cuda.py`.
 """
 
 import math

@@ -1,6 +1,8 @@
 """Histograms along a ray: inverse transform sampling of piecewise constant densities.
 
 Letters: `edges` are bins + 1 increasing fenceposts, `weights` the mass of each bin, `u` uniform numbers in [0, 1).
+
+`kernels/histograms/cpu.py` and `cuda.py` compute the same; `HISTOGRAM_PADDING` is in `op.py` there.
 """
 
 import torch

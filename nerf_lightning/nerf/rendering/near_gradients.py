@@ -1,6 +1,7 @@
 """Gradients scaled down near cameras, against floaters (Philip and Deschaintre, EGSR 2023, arXiv 2305.02756).
 
 The distance: `gradient_scaling_distance` in conf/model/fast_proposal.yaml.
+Kernels repeat it: `kernels/render/compositing.py` and `cuda.py`, `kernels/field/cuda.py`.
 """
 
 from typing import Any

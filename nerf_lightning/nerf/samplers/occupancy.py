@@ -1,6 +1,7 @@
 """An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989).
 
 Its numbers: `conf/sampler/occupancy.yaml` and its variants.
+The march itself: `kernels/march/`.
 """
 
 import logging

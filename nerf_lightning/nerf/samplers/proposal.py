@@ -1,4 +1,7 @@
-"""Samples drawn from what a cheaper level saw: the proposals of mip-NeRF 360 (Sec. 3, arXiv 2111.12077)."""
+"""Samples drawn from what a cheaper level saw: the proposals of mip-NeRF 360 (Sec. 3, arXiv 2111.12077).
+
+How many, and the weight added to each interval: `conf/sampler/proposal.yaml`.
+"""
 
 import torch
 

@@ -1,4 +1,7 @@
-"""What the photographs' frames and alpha say about space before training: cells that are seen, but not through."""
+"""What the photographs' frames and alpha say about space before training: cells that are seen, but not through.
+
+What one view carves: `kernels/carving/reference.py`, and for pinholes `cpu.py`.
+"""
 
 import math
 

@@ -1,6 +1,7 @@
 """Stratified samples between near and far (Eq. 2, arXiv 2003.08934).
 
 How many: `conf/sampler/stratified.yaml` and its variants. Near and far: `data/captures/frame_and_extent.py`.
+`kernels/histograms/cpu.py` and `cuda.py` compute the same.
 """
 
 import torch

@@ -1,4 +1,7 @@
-"""What loggers show of a run besides its curves: the config as text, and a row in the hyperparameter table."""
+"""What loggers show of a run besides its curves: the config as text, and a row in the hyperparameter table.
+
+Which settings have a column: `has_column` in `config/setting_rules.py`.
+"""
 
 from itertools import islice
 from typing import Any

@@ -1,4 +1,7 @@
-"""One line with the progress of training: step, loss, PSNR, rays per second, time left."""
+"""One line with the progress of training: step, loss, PSNR, rays per second, time left.
+
+From when on it shows the time left: FORESEEN_FROM in `messages/console.py`.
+"""
 
 import logging
 import time

@@ -1,8 +1,9 @@
 """Multiresolution hash grid: features interpolated between the vertices of grids of growing resolution.
 
 Sec. 3 of arXiv 2201.05989. Letters: R_l the cells along a side of level l, T the maximum number of entries of a level's
-table,
-F the features of an entry.
+table, F the features of an entry.
+
+Resolutions and the hash's primes: `layout.py`. `reference.py`, `cpu.py` and `cuda.py` interpolate alike.
 """
 
 import threading
