@@ -35,7 +35,7 @@ for (const pre of document.querySelectorAll(".highlight pre")) {
     else open.push(tag);
     return tag;
   });
-  pre.innerHTML = split.replace(/\n$/, "").split("\n").map(line => `<span class="of-code">${line}</span>`).join("");
+  pre.innerHTML = split.replace(/\n$/, "").split("\n").map(line => `<span class="of-code">${line}\n</span>`).join("");
   for (const line of pre.children) line.style.setProperty("--indent", `${line.textContent.match(/^ */)[0].length}ch`);
 }
 
