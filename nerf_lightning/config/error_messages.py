@@ -1,4 +1,7 @@
-"""Errors as one paragraph: Hydra's and OmegaConf's, with near matches for a mistyped key; out of memory; a GPU's."""
+"""Errors as one paragraph: Hydra's and OmegaConf's, with near matches for a mistyped key; out of memory; a GPU's.
+
+Values of the wrong type: `require_fitting` in `instantiate.py`.
+"""
 
 import os
 import re

@@ -1,4 +1,7 @@
-"""Open a checkpoint: choose the device, read the file, build and prepare its model."""
+"""Open a checkpoint: choose the device, read the file, build and prepare its model.
+
+Which file of a run folder is read, and what is said if there is none: `checkpoints/reading.py`.
+"""
 
 import logging
 from collections.abc import Sequence

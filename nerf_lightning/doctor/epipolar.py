@@ -1,4 +1,7 @@
-"""Check poses against matched places: each must lie on the epipolar line of the other's ray."""
+"""Check poses against matched places: each must lie on the epipolar line of the other's ray.
+
+What share of them must: SOUND and HOPELESS in `poses.py`.
+"""
 
 import torch
 from jaxtyping import Bool, Float

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from nerf_lightning.doctor.check import MORE_DETAILS, Analysis, Check, CheckFn, look, not_judged, ok, wrong
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
-from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.epipolar import TOLERANCE, agreeing
+from nerf_lightning.doctor.features import LONGER_SIDE
 from nerf_lightning.doctor.matches import Matches, Proof, strongest_proof
 from nerf_lightning.doctor.second_opinion import (
     CONVINCING,
@@ -48,7 +49,7 @@ def poses_and_pixels(analysis: Analysis) -> Check:
     share, count = analysis.agreement, len(analysis.matches.view)
     if count < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
-    message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
+    message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to {TOLERANCE} pixels of {LONGER_SIDE})"
     if share >= SOUND:
         return ok(message)
     return _by_clear_pairs(analysis, message)

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import usable
-from nerf_lightning.data.captures.intrinsics import cameras_of
+from nerf_lightning.data.captures.fit_to_pictures import cameras_of
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.scene import Spaces, check_extent, scene_of
 from nerf_lightning.data.pixels.decoded_photographs import Photograph

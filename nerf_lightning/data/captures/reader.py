@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import check_metres, check_step, usable
+from nerf_lightning.data.captures.fit_to_pictures import as_calibrated, cameras_of
 from nerf_lightning.data.captures.folders import located, named_folder, require_one
-from nerf_lightning.data.captures.intrinsics import as_calibrated, cameras_of
 from nerf_lightning.data.captures.mask_files import with_masks
 from nerf_lightning.data.captures.scene import Coordinates, Spaces, check_extent, scene_of
 from nerf_lightning.data.captures.splits import MEMORISED, every_kth, without_held_out

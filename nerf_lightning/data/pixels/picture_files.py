@@ -1,6 +1,6 @@
 """Read picture files as 8-bit RGBA with straight alpha, and depth maps.
 
-Which formats are read: `formats.py`. Whether EXIF orientation turns photographs: `captures/intrinsics.py`, and
+Which formats are read: `formats.py`. Whether EXIF orientation turns photographs: `captures/fit_to_pictures.py`, and
 before poses are found, `sfm/photograph_folder.py`.
 """
 

@@ -2,6 +2,7 @@
 
 Letters: sigma_i density of interval i, delta_i its length, alpha_i = 1 - exp(-sigma_i delta_i) what it absorbs,
 T_i = exp(-sum_{j<i} sigma_j delta_j) the light that reaches its start, w_i = T_i alpha_i. Samples are the last axis.
+Light that escapes, and its depth: `Rendering.from_sums` in `nerf/types/renderings.py`.
 The kernels in `kernels/ragged` and `kernels/render` compute the same, and must change with it.
 """
 

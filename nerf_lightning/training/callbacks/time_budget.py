@@ -90,10 +90,15 @@ class TimeBudget(Callback):
         """Estimate the length of the run, and stop when time is over; the first step compiles, and is not counted."""
         now = time.perf_counter()
         if not self.compiles:
-            # All processes stop at the same step: the slowest clock counts for all.
-            self.used = ranks.largest(self.used + now - self.since)
+            self.used += now - self.since
         self.compiles, self.since = False, now
-        if self.used and pl_module.train_step.progress.step % self.every_steps == 0:
+        is_time = pl_module.train_step.progress.step % self.every_steps == 0
+        if ranks.world_size() > 1:
+            # All stop at the same step, by the slowest clock; comparing them in each step would take time.
+            if not is_time:
+                return
+            self.used = ranks.largest(self.used)
+        if self.used and is_time:
             self._fit_schedule(trainer, pl_module.train_step)
         if self.used >= self.seconds:
             trainer.should_stop = True
