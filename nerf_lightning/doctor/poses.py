@@ -49,7 +49,8 @@ def poses_and_pixels(analysis: Analysis) -> Check:
     share, count = analysis.agreement, len(analysis.matches.view)
     if count < FEWEST:
         return not_judged(TOO_FEW, MORE_DETAILS)
-    message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to {TOLERANCE} pixels of {LONGER_SIDE})"
+    near = f"(to {TOLERANCE} pixels of {LONGER_SIDE})"
+    message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say {near}"
     if share >= SOUND:
         return ok(message)
     return _by_clear_pairs(analysis, message)
