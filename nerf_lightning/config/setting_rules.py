@@ -3,6 +3,8 @@
 A group that is not in the table may be set only on the command line; a new reader, field, loss or callback has the row
 of its group. `x.*` is each key in the section x, and `x.**` is x and everything below it. The most specific entry
 applies: a setting of a trusted group that says where to write, what to fetch or how far to trust needs its own.
+
+Combinations that do not work are refused by the parts themselves, in `fit_to` or their constructors.
 """
 
 import hashlib

@@ -1,4 +1,7 @@
-"""A mesh of the surface, from the density or from what the views see, cleaned, colored, in the user's frame."""
+"""A mesh of the surface, from the density or from what the views see, cleaned, colored, in the user's frame.
+
+Its numbers: `conf/what/mesh.yaml`. Which parts are left out as floaters: `without_floaters` in `density_mesh.py`.
+"""
 
 import logging
 from dataclasses import dataclass

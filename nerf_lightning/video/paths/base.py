@@ -3,7 +3,7 @@
 The user's input and output (positions, distances, directions) is in the frame and the units of the capture's own files;
 `PathFrame.to_user` maps the working frame to it.
 
-The defaults of size and frames per second: `conf/path_defaults.yaml`; the numbers of each path: `conf/path/`.
+The defaults of size and frames per second: `conf/camera_path_defaults.yaml`; the numbers of each path: `conf/path/`.
 """
 
 import math
