@@ -196,7 +196,8 @@ def known_settings():
     for conf, file in ((folder, file) for folder in conf_folders() for file in folder.rglob("*.yaml")):
         text = file.read_text(encoding="utf-8")
         group = file.relative_to(conf).parent.as_posix()
-        shared = {"scene_defaults": "scene", "camera_path_defaults": "path"}.get(file.stem, "") if group == "." else group
+        base = {"scene_defaults": "scene", "camera_path_defaults": "path"}
+        shared = base.get(file.stem, "") if group == "." else group
         prefix = "" if "@package _global_" in text else shared.replace("/", ".")
         gather(yaml.safe_load(text) or {}, prefix)
         if group == "what":
