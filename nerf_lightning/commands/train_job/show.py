@@ -1,6 +1,7 @@
 """The last lines of a run: Lightning's profile, exports of the scene, the report, and the result in a sentence.
 
-The lines on video and checkpoint: `evaluate_and_film.py`; those of the metrics: `evaluation/main_numbers.py`.
+The lines on video and checkpoint: `evaluate_and_film.py`; those of the metrics: `evaluation/main_numbers.py`;
+those before training: `fit.py`.
 """
 
 import logging
