@@ -1,4 +1,7 @@
-"""Fit a job's system: choose precision and tile, announce the run, and let Lightning's Trainer take the steps."""
+"""Fit a job's system: choose precision and tile, announce the run, and let Lightning's Trainer take the steps.
+
+The lines before training, and those of a run that is stopped, are here; those after it in `show.py`.
+"""
 
 import logging
 import shlex

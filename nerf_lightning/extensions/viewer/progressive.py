@@ -1,6 +1,7 @@
 """One user's picture: coarse at once, then progressively finer while the request is unchanged.
 
-How coarse: `SlicedRenderer.height_while_moving` in `renderer.py`. The quality of its JPEG: QUALITY in `client.py`.
+How coarse: `SlicedRenderer.height_while_moving` in `renderer.py`; during training, MOVING_SECONDS in `live_view.py`.
+The quality of its JPEG: QUALITY in `client.py`.
 """
 
 from collections.abc import Callable, Generator

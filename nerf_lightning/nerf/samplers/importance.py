@@ -1,6 +1,7 @@
 """Importance samples where the previous level saw something (Sec. 5.2, arXiv 2003.08934).
 
-How many: `conf/sampler/importance.yaml` and its variants.
+How many: `conf/sampler/importance.yaml` and its variants. What is added to the weights, so that
+empty intervals draw samples: HISTOGRAM_PADDING in `kernels/histograms/op.py`.
 """
 
 from dataclasses import replace
@@ -20,7 +21,6 @@ class ImportanceSampler(DenseSampler):
 
     The histogram is of the interior intervals (without the first and last, as in the paper's code, so that light that a
     closed ray assigns to its last interval draws no samples). Positions carry no gradients: the weights are detached.
-    `HISTOGRAM_PADDING` in `kernels/histograms/op.py` is added to each weight, so that empty intervals draw samples.
 
     Args:
         num_samples: intervals added to those of the previous level.

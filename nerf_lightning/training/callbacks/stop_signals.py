@@ -1,4 +1,7 @@
-"""On Ctrl-C, SIGTERM, a scheduler's signal or a sweep's stop: finish the step, save, stop; without its folder, stop."""
+"""On Ctrl-C, SIGTERM, a scheduler's signal or a sweep's stop: finish the step, save, stop; without its folder, stop.
+
+What is said then, with the command that resumes: `commands/train_job/fit.py`.
+"""
 
 import os
 import signal
