@@ -1,4 +1,7 @@
-"""The surface that the views see, as a mesh: their rendered depth, fused into one truncated signed distance."""
+"""The surface that the views see, as a mesh: their rendered depth, fused into one truncated signed distance.
+
+Truncation and resolution: `conf/what/mesh.yaml`.
+"""
 
 from dataclasses import replace
 

@@ -2,7 +2,7 @@
 
 The preceding `last.ckpt` is kept as `previous.ckpt` (`checkpoints/writing.py` rotates them).
 
-How often, and what is best (`monitor`): `conf/callbacks/default.yaml`.
+The files' names: `checkpoints/format.py`. How often, and what is best (`monitor`): `conf/callbacks/default.yaml`.
 """
 
 from pathlib import Path
