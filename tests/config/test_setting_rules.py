@@ -64,7 +64,7 @@ def test_no_entry_stands_twice_and_each_is_of_a_key():
 def test_every_setting_and_every_group_is_decided_about():
     settings = {key for key in flatten(composed("train")) if not names_a_class(key)}
     assert [key for key in settings if row_of(key) is None] == []
-    others = {"hydra", "logger", "output", "budgets", "viewer", "what"}
+    others = {"hydra", "logger", "folders", "budgets", "viewer", "what"}
     assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"} - {"final"}  # of which nothing is chosen
     for group in others:
         assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group

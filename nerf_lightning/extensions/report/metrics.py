@@ -65,9 +65,9 @@ def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
         key: [(ROWS.get((key, name), _name(name))[:80], _said(name, value)) for name, value in found]
         for key, found in told.items()
     }
-    if ("scene", origin := dict(pairs["origin"]).get("scene")) in pairs["protocol"]:  # a capture without a name
+    if any(pair[0] == "scene" and pair in pairs["protocol"] for pair in pairs["origin"]):  # the capture has no name
         pairs["protocol"] = [("format" if key == "scene" else key, text) for key, text in pairs["protocol"]]
-        pairs["origin"].remove(("scene", origin))
+        pairs["origin"] = [pair for pair in pairs["origin"] if pair[0] != "scene"]
     if pairs["protocol"] and metrics.get("lpips") is None:
         pairs["protocol"] = [*(pair for pair in pairs["protocol"] if pair[0] != "LPIPS"), ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]

@@ -74,7 +74,7 @@ def test_what_it_shows_of_the_model_is_printed_and_stands_in_the_page(tmp_path, 
     assert "dB on 1 test view; the model, compared in the same way" in out
     assert "fitted to photographs for 0.5 s" in out
     text = target.read_text()
-    assert " on 1 test view<" in text
+    assert " on 1 test view without lens distortion<" in text
     assert "without lens distortion" in text
     exported(tmp_path, max_views=0)  # over our own page
     assert "dB" not in capsys.readouterr().out
