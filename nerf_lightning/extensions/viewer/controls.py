@@ -23,7 +23,7 @@ from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
 STYLE = Path(__file__).parent / "panel.css"
-PHONE = 0.7  # Width over height of windows on phones; their pixels are as many as a desktop's.
+PHONE = 0.8  # Width over height of windows on phones; their pixels are as many as a desktop's.
 SAVE = "Save picture"  # Names are those of exported pages.
 LEAST_SHARE = 0.01  # The crop box keeps at least this share of the scene's box along each axis.
 MOVES = "Drag to rotate, drag with the right button to move, scroll to zoom. W A S D Q E fly."

@@ -93,7 +93,7 @@ def test_nothing_overlaps_or_hides_the_first_view_on_desktops_and_phones(page):
             # Fingers or keys: what there is.
             press(driver, "i")
             controls = driver.find_element("css selector", "#numbers").text
-            assert ("two fingers" in controls, "Shift and drag" in controls) == (size == "phone", size != "phone")
+            assert ("two fingers" in controls, "Shift + drag" in controls) == (size == "phone", size != "phone")
             assert layout_faults(driver, size, "document.getElementById('tools').open = true") == []
             controls = "[...document.querySelectorAll('button, select, summary, label')]"
             heights = driver.execute_script(f"return {controls}.map(each => each.getBoundingClientRect().height)")
