@@ -17,8 +17,6 @@ FORMATS = {
     "seconds": "{:.3f}",
 }
 NAMES = {"psnr": "PSNR", "cc_psnr": "PSNR with fitted colors", "ssim": "SSIM", "lpips": "LPIPS"}
-SHOWN_FIRST = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
-"""Labels of the numbers that a page does not fold or leave out."""
 LABELS = {
     **{metric: name for metric, name in NAMES.items() if metric != "psnr"},
     "depth_error": "mean depth error (scene units)",

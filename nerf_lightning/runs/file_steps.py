@@ -14,6 +14,11 @@ def record_steps(folder: Path, files: Iterable[Path], step: int) -> None:
     write_json(folder / STEPS, read_steps(folder) | dict.fromkeys(sorted(names), step))
 
 
+def exported_files(folder: Path) -> list[Path]:
+    """Return the files of a folder of exports, which may be missing."""
+    return [file for file in sorted(folder.glob("*")) if file.is_file() and file.name != STEPS]
+
+
 def read_steps(folder: Path) -> dict[str, int]:
     """Return the recorded step of each file in a folder; what is not recorded is missing."""
     steps = {name: number(step) for name, step in read_json_object(folder / STEPS).items()}

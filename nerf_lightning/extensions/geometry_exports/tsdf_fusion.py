@@ -1,8 +1,6 @@
 """Fuse depth maps on a grid, on the CPU: the mean of truncated distances (Curless and Levoy, SIGGRAPH 1996).
 
-How much a view's pixel counts: `fused_mesh.py`.
-
-Truncation and resolution: `conf/what/mesh.yaml`.
+How much a view's pixel counts: `fused_mesh.py`. Truncation and resolution: `conf/what/mesh.yaml`.
 """
 
 from typing import no_type_check

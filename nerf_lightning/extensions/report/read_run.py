@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from nerf_lightning.checkpoints.reading import Checkpoint, newest_checkpoint
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.evaluation.main_numbers import SHOWN_FIRST, main_numbers
+from nerf_lightning.evaluation.main_numbers import main_numbers
 from nerf_lightning.extensions.report.charts import drawn
 from nerf_lightning.extensions.report.coverage import coverage_map
 from nerf_lightning.extensions.report.metrics import depth_scale, per_image, tables, views_on_page
@@ -21,10 +21,12 @@ from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.curves import read_curves
-from nerf_lightning.runs.file_steps import STEPS, read_steps
+from nerf_lightning.runs.file_steps import exported_files, read_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
 
 MOST_STEPS = 24
+MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
+"""Labels of the numbers that are not folded."""
 SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
 PAGE_AGE = "Exported at step {step:,}; training has reached step {last:,}."
@@ -106,8 +108,7 @@ def address_from(file: Path, folder: Path) -> str:
 
 def _add_exports(report: Report, exported: Path, folder: Path, step: int | None) -> None:
     """Link what nerf export wrote; of pages, only ours. `step` is the last checkpoint's, None if unknown."""
-    steps, files = read_steps(exported), sorted(exported.glob("*"))
-    files = [file for file in files if file.is_file() and file.suffix != ".html" and file.name != STEPS]
+    steps, files = read_steps(exported), [file for file in exported_files(exported) if file.suffix != ".html"]
     for file in files[:MOST_EXPORTS]:
         note = ", ".join(filter(None, (f"{file.stat().st_size / 1e6:.2g} MB", _age(steps.get(file.name), step))))
         report.exports.append((f"{file.name} ({note})", address_from(file.absolute(), folder)))
@@ -128,8 +129,8 @@ def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:
     report.result = str(note.get("result", ""))[:LONGEST_RESULT]
     report.command = _resume_command(resume, str(note.get("resume_with", ""))[:LONGEST_RESULT])
     known = main_numbers(metrics, note)
-    report.facts = [pair for pair in known if pair[0] in SHOWN_FIRST]
-    report.more_facts = [pair for pair in known if pair[0] not in SHOWN_FIRST]
+    report.facts = [pair for pair in known if pair[0] in MAIN]
+    report.more_facts = [pair for pair in known if pair[0] not in MAIN]
     report.columns, report.per_image = per_image(metrics)
     report.split = str(mapping(metrics.get("protocol")).get("split", "test"))[:20]
     report.tables = tables(metrics)

@@ -6,23 +6,19 @@ from typing import Any
 from nerf_lightning.extensions.viewer.client import ViewerClient
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.escaping import for_terminal
-from nerf_lightning.runs.file_steps import STEPS
+from nerf_lightning.runs.file_steps import exported_files
 
 MOST_BYTES = 1 << 28  # A larger file would fill the memory of browser and viewer.
 MOST_LETTERS = 60
-
-
-def exported_files(folder: Path) -> list[Path]:
-    """Return the files of a run's exports in a folder, which may be missing; links may lead anywhere."""
-    found = (file for file in sorted(folder.glob("*")) if not file.name.startswith(".") and file.name != STEPS)
-    return [file for file in found if file.is_file() and not file.is_symlink()]
 
 
 class ExportPanel:
     """Let one user download what is in the folder of exports when they connect."""
 
     def __init__(self, session: ViewerClient, folder: Path):
-        self.session, files = session, exported_files(folder)
+        # Links may lead anywhere.
+        files = [each for each in exported_files(folder) if not each.name.startswith(".") and not each.is_symlink()]
+        self.session = session
         if not files:
             return
         gui, harmless = session.client.gui, session.queue.errors.harmless

@@ -86,6 +86,26 @@ def test_a_run_that_had_no_budget_has_all_of_it_from_where_it_is_gone_on_with(mo
     assert system.train_step.num_steps == 500 + 3 * 20.0 / 2.0
 
 
+def test_several_processes_stop_together_and_compare_their_clocks_only_at_times(monkeypatch):
+    now, compared = [0.0], []
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time_budget.ranks, "world_size", lambda: 2)
+    # The other process is a second slower each time.
+    monkeypatch.setattr(time_budget.ranks, "largest", lambda used: compared.append(used) or used + 1.0)
+    budget, system, run = TimeBudget(seconds=20.0, every_steps=10), a_system(step=0), trainer()
+    run.should_stop = False
+    budget.on_train_start(run, system)
+    stops = []
+    for step in range(1, 31):
+        now[0] += 1.0
+        system.train_step.progress.step = step
+        budget.on_train_batch_end(run, system, None, None, 0)
+        stops.append(run.should_stop)
+    assert compared == [9.0, 20.0, 31.0]
+    assert stops.index(True) + 1 == 20
+    budget.teardown(run, system, "fit")
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no process is stopped there")
 def test_a_stopped_process_uses_no_time(monkeypatch):
     now = [100.0]

@@ -12,6 +12,7 @@ from support.running import refused, said
 from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
@@ -146,3 +147,7 @@ def test_bad_input_is_one_paragraph_and_leaves_nothing(nerf, tmp_path):
     ):
         said(nerf("prune", f"ckpt={tiny}", setting), *words)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiny.ckpt"]
+
+
+def test_a_run_needs_no_key():
+    assert prepared("prune", ["outputs/run", "keep=0.5"]) == ["keep=0.5", "ckpt='outputs/run'"]

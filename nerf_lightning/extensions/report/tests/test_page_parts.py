@@ -10,7 +10,7 @@ from PIL import Image
 from support.shiny_ball import all_around, record_of
 
 from nerf_lightning.evaluation.main_numbers import main_numbers
-from nerf_lightning.extensions.report.charts import MOST_CURVES, drawn
+from nerf_lightning.extensions.report.charts import CHARTS, MOST_CURVES, drawn
 from nerf_lightning.extensions.report.coverage import coverage_map
 from nerf_lightning.extensions.report.metrics import WITHOUT_LPIPS, depth_scale, per_image, tables, views_on_page
 from nerf_lightning.extensions.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
@@ -47,7 +47,7 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
     (psnr,) = drawn(curves)  # of the losses, one point each can be drawn
-    assert psnr.label == "PSNR (dB)"
+    assert (psnr.label, psnr.note) == ("PSNR (dB)", CHARTS[0].note)
     assert [curve["label"] for curve in psnr.curves] == ["training", "validation"]
     assert psnr.curves[0]["values"] == [10.0, 20.0, 25.0]
     two = drawn({f"PSNR/train_{level}": (steps, [1.0, 2.0, end]) for level, end in (("coarse", 3.0), ("fine", 4.0))})
@@ -81,10 +81,11 @@ def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
     curves = {f"Training loss/{number}": ([1, 2], [1.0, 2.0 + number]) for number in range(3000)}
     (drawing,) = drawn(curves)
     assert len(drawing.curves) == MOST_CURVES
-    assert drawing.note.endswith("2988 more curves are in the run's TensorBoard files.")
+    assert drawing.note == f"{CHARTS[1].note} 2988 more curves are in the run's TensorBoard files."
     write_report(Report("a run", charts=[drawing]), tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
-    assert " 2988 more curves are in the run&#x27;s TensorBoard files.</figcaption>" in text
+    note = f"{CHARTS[1].note} 2988 more curves are in the run&#x27;s TensorBoard files."
+    assert f'<figcaption class="quiet">{note}</figcaption>' in text
 
 
 @pytest.mark.parametrize("name", [[], {}, "x" * 5000, "a\x00", 10**400], ids=lambda name: str(name)[:9])

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from support.viewer_panel import Panel
 
 from nerf_lightning.extensions.viewer import controls
-from nerf_lightning.extensions.viewer.export_panel import exported_files
 from nerf_lightning.messages.escaping import as_code, for_terminal
+from nerf_lightning.runs.file_steps import STEPS, exported_files
 
 
 def snapshot(panel):
@@ -157,12 +157,12 @@ def test_surrogates_and_line_ends_are_shown_as_something_and_long_texts_are_cut(
 
 def test_exported_files_are_downloaded_and_one_that_has_gone_is_said(tmp_path):
     assert exported_files(tmp_path / "none") == []
-    for name in ("splats.ply", ".part"):
+    for name in ("splats.ply", ".part", STEPS):
         (tmp_path / name).write_bytes(b"ply")
     (tmp_path / "link.ply").symlink_to(tmp_path / "splats.ply")
     panel = Panel(tmp_path, exports=tmp_path)
     (button,) = (label for label in panel.gui.made if label.startswith("splats.ply ("))
-    assert not any(label.startswith("link.ply") for label in panel.gui.made)
+    assert not any(label.startswith(("link.ply", ".part", STEPS)) for label in panel.gui.made)
     panel.press(button)
     panel.client.send_file_download.assert_called_once_with("splats.ply", b"ply")
     (tmp_path / "splats.ply").unlink()
