@@ -100,8 +100,6 @@ class TrainStep:
         objective, progress = self.objective, self.progress
         if self.num_steps is None:
             raise InputError("The length of the run is not known, which the learning rate follows: give num_steps=....")
-        if ranks.world_size() > 1:
-            batch = batch.now()  # whose weights are summed over the processes first
         with self.tiles.on_threads(self.device):
             optimizer.zero_grad()
             begin_step(objective, StepContext(progress.step / self.num_steps, progress.step, self.key))
@@ -112,7 +110,7 @@ class TrainStep:
                 taken, seen = True, self._replayed(self.gradients, batch, optimizer, backward, measure_gradients)
             else:
                 batch = batch.now()
-                seen = self.tiles(batch, self.key, self._share(batch), backward)
+                seen = self.tiles(batch, self.key, self._share(), backward)
                 self._add_up(seen)
                 taken = self.guard.allows(seen.losses, objective.named_weights())
                 if taken:
@@ -127,12 +125,12 @@ class TrainStep:
                 self._choose_batch()
             return seen
 
-    def _share(self, batch: Batch | LazyBatch) -> Share | None:
+    def _share(self) -> Share | None:
         """Return this process's share of the batch; None: all of it."""
-        if isinstance(batch, LazyBatch) or ranks.world_size() == 1:
+        if ranks.world_size() == 1:
             return None
         first = ranks.share(self.progress.batch_rays // self.objective.pixels_per_patch).start
-        return Share(first * self.objective.pixels_per_patch, self.progress.batch_rays, ranks.total(batch.weight.sum()))
+        return Share(first * self.objective.pixels_per_patch, self.progress.batch_rays)
 
     def _replayed(
         self, gradients: Any, batch: Batch | LazyBatch, optimizer: Any, backward: Backward, measure_gradients: bool
@@ -153,7 +151,7 @@ class TrainStep:
             update = None if recorded is None else recorded.next_update
             changes = [*self.guard.tensors(batch.device), *(() if update is None else update.tensors())]
             rest = Rest(self._add_up, finish, changes, kind=(measure_gradients, update))
-            outputs.append(gradients(batch, self.key, self._share(batch), backward, rest))
+            outputs.append(gradients(batch, self.key, self._share(), backward, rest))
             if recorded is not None:
                 recorded.gradients_are_zero()
 

@@ -67,30 +67,41 @@ def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_
     assert sorted(size for size, _ in run.training.gradients.recordings) == [32, 48]
 
 
+def trained_lazily(record, size=48, rank=0):
+    """Take steps on batches that are gathered by numbers, and return the run."""
+    run = trained([], record)
+    run.training.progress.batch_rays = 48
+    scene, domain = run.loader.scene, run.loader.whole
+
+    def gather(numbers):
+        batch = gather_batch(scene, domain.locate((numbers[0] + 7 * torch.arange(size)) % len(domain)))
+        return replace(batch, weight=1.0 + (numbers[0] % 5) * torch.arange(size) / size)
+
+    for first in (0, 900, 11):
+        batch = LazyBatch(size, (first + 100 * rank,), "rays", gather, CPU)
+        run.losses.append(run.training(batch, run.optimizer).losses.sum())
+    return run
+
+
 def test_a_replay_gathers_a_lazy_batch_by_its_own_numbers():
-    runs = [trained([], record) for record in (True, False)]
-    for run in runs:
-        scene, domain = run.loader.scene, run.loader.whole
-
-        def gather(numbers, scene=scene, domain=domain):
-            return gather_batch(scene, domain.locate((numbers[0] + 7 * torch.arange(48)) % len(domain)))
-
-        for first in (0, 900, 11):
-            batch = LazyBatch(48, (first,), "rays", gather, CPU)
-            run.losses.append(run.training(batch, run.optimizer).losses.sum())
-    assert_same(*runs)
-    assert len(runs[0].training.gradients.recordings) == 1
-    assert runs[0].all_losses().unique().numel() == 3
+    run = trained_lazily(True)
+    assert_same(run, trained_lazily(False))
+    assert len(run.training.gradients.recordings) == 1
+    assert run.all_losses().unique().numel() == 3
 
 
 IN_TWO = """
-from test_recorded_gradients import CPU_BACKENDS, OccupancySampler, trained, without
+from test_recorded_gradients import CPU_BACKENDS, OccupancySampler, trained, trained_lazily, without
 OccupancySampler.capacity_for = lambda sampler, rays: 8192
 with without(*CPU_BACKENDS):
     runs = [trained([48, 32, 48, 47], record) for record in (True, False)]
+    lazy = [trained_lazily(record, 24, rank) for record in (True, False)]
 sizes = [size for size, _ in runs[0].training.gradients.recordings]
-replayed, taken = ((run.all_losses(), run.training.objective.model.state_dict()) for run in runs)
-result = sizes, replayed, taken, [each.detach() for each in runs[0].training.objective.model.parameters()]
+replayed, taken = (
+    [(run.all_losses(), run.training.objective.model.state_dict()) for run in each] for each in zip(runs, lazy)
+)
+weights = [each.detach() for run in (runs[0], lazy[0]) for each in run.training.objective.model.parameters()]
+result = sizes, replayed, taken, weights
 """
 
 

@@ -220,7 +220,7 @@ def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(t
     for train_step in (light, heavy):
         batch = batch_of(train_step)
         for part in parts:
-            train_step.gradients(batch[part], train_step.key, Share(part.start, 64, batch.weight.sum()))
+            train_step.gradients(batch[part], train_step.key, Share(part.start, 64))
     torch.testing.assert_close(
         heavy.objective.rays.shift.grad - light.objective.rays.shift.grad, torch.full((6, 3), -10.0)
     )

@@ -11,7 +11,7 @@ each decision of a model on the host has its own recordings (`Part.step_variant`
 
 import logging
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ WARM_UPS = 3
 
 log = logging.getLogger(__name__)
 
-Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOutput]]
+Recorder = Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]
 """Takes work; returns a function that repeats it on the same memory, and its result, which each repetition
 overwrites."""
 
@@ -42,14 +42,14 @@ overwrites."""
 class CudaGraphs:
     """Record work as CUDA graphs, each after a few rounds on a separate stream.
 
-    All share the memory of intermediate results, since no two run at a time and none reads what another has left: many
-    batch sizes take as much memory as the largest.
+    All share the memory of intermediate results, since no two run at a time and results that others read stay
+    allocated: many batch sizes take as much memory as the largest.
     """
 
     def __init__(self) -> None:
         self.pool: Any = None
 
-    def __call__(self, work: Callable[[], StepOutput]) -> tuple[Callable[[], None], StepOutput]:
+    def __call__(self, work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
         """Return a function that repeats the work, and its result."""
         if self.pool is None:
             self.pool = torch.cuda.graph_pool_handle()
@@ -83,11 +83,14 @@ class Rest:
 class _Recording:
     """A recording for one batch size."""
 
-    batch: Batch | None
-    """What later batches are copied to; None: `replay` gathers them by their numbers."""
-    share: Share | None
+    batch: Batch | LazyBatch
+    """Where later batches are copied; a lazy one is gathered by its numbers."""
     numbers: Tensor
     """The key of the step's random numbers, and those of a lazy batch."""
+    weigh: Callable[[], None] | None
+    """Gathers a process's share of the batch and computes `weight`; None: one process, and `replay` does this."""
+    weight: Tensor | None
+    """Sum of the weights of the batch."""
     replay: Callable[[], None]
     output: StepOutput
     finish: Callable[[], None] | None
@@ -157,9 +160,12 @@ class RecordedGradients:
         if kind not in self.recordings:
             self.recordings[kind] = self._recorded(batch, (key, *numbers), share, rest)
         kept = self.recordings[kind]
-        if isinstance(batch, Batch) and kept.batch is not None:
-            _copy(_inputs(kept.batch, kept.share), _inputs(batch, share))
         overwrite(kept.numbers, np.array((key, *numbers)))
+        if isinstance(batch, Batch) and isinstance(kept.batch, Batch):
+            _copy(kept.batch.tensors(), batch.tensors())
+        if kept.weigh is not None and kept.weight is not None:
+            kept.weigh()
+            ranks.add_up([kept.weight])
         kept.replay()
         if kept.finish is not None and rest is not None:
             rest.add_up(kept.output)
@@ -172,35 +178,39 @@ class RecordedGradients:
         self, batch: Batch | LazyBatch, numbers: tuple[int, ...], share: Share | None, rest: Rest | None
     ) -> _Recording:
         of_step = torch.tensor(numbers, device=batch.device)
-        kept = None if isinstance(batch, LazyBatch) else batch.map(_copied)
-        share = None if share is None else replace(share, weight=share.weight.clone())
+        kept = batch.map(_copied) if isinstance(batch, Batch) else batch
+
+        def weighed() -> tuple[Batch, Tensor]:
+            pixels = kept.gather(of_step[1:]) if isinstance(kept, LazyBatch) else kept
+            return pixels, pixels.weight.sum()
+
+        # Sums over processes are not recorded: what is before, between and after them is replayed in turn.
+        weigh, of_share = (None, None) if share is None else self.record(weighed)
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
         changed = [*sample_counts(self.tiles.objective), *([] if rest is None else rest.changes)]
         before = [each.clone() for each in changed]
-        # Sums over processes are not recorded: what precedes them and what follows are replayed one after another.
-        together = rest is None or ranks.world_size() == 1
 
         def work() -> StepOutput:
             self._zero_gradients()
-            pixels = batch.gather(of_step[1:]) if isinstance(batch, LazyBatch) else kept
-            assert pixels is not None
-            whole = Share.whole(pixels) if share is None else share
-            seen = self.tiles.in_tiles_of(pixels.num_rays, pixels, whole, of_step[0])
-            return rest.finish(seen) if rest is not None and together else seen
+            pixels, weight = weighed() if of_share is None else of_share
+            seen = self.tiles.in_tiles_of(pixels.num_rays, pixels, weight, of_step[0], share)
+            return rest.finish(seen) if rest is not None and share is None else seen
 
         finish = None
         try:
             replay, seen = self.record(work)
-            if rest is not None and not together:
+            if rest is not None and share is not None:
                 of_gradients, whole_step = seen, rest
                 finish, seen = self.record(lambda: whole_step.finish(of_gradients))
         finally:
             for each, former in zip(changed, before, strict=True):
                 each.copy_(former)
         self._zero_gradients(all_of_them=True)
-        return _Recording(kept, share, of_step, replay, seen, finish, [each.grad for each in self.parameters])
+        weight = None if of_share is None else of_share[1]
+        gradients = [each.grad for each in self.parameters]
+        return _Recording(kept, of_step, weigh, weight, replay, seen, finish, gradients)
 
     def _zero_gradients(self, all_of_them: bool = False) -> None:
         for parameter in self.parameters:
@@ -213,11 +223,7 @@ def _copied(tensor: Tensor) -> Tensor:
     return tensor.clone(memory_format=torch.contiguous_format)
 
 
-def _inputs(batch: Batch, share: Share | None) -> list[Tensor]:
-    return [*batch.tensors(), *([] if share is None else [share.weight])]
-
-
-def _copy(targets: list[Tensor], sources: list[Tensor]) -> None:
+def _copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """Copy tensors, whatever their types, in one kernel; the targets are contiguous."""
     ours, theirs = (
         [each.view(torch.int32) for each in targets],

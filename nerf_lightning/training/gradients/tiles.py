@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.hash_grid.op import TableGradient, add_all, defer_table_grads
 from nerf_lightning.nerf.kernels.render.workspace import forget_workspaces
@@ -43,13 +45,6 @@ class Share:
     """Slot of its first ray in the batch."""
     num_rays: int
     """Rays of the whole batch."""
-    weight: Tensor
-    """Sum of the weights of the whole batch."""
-
-    @classmethod
-    def whole(cls, batch: Batch) -> "Share":
-        """Return the share that is the whole batch."""
-        return cls(0, batch.num_rays, batch.weight.sum())
 
 
 def torch_backward(loss: Tensor) -> None:
@@ -91,12 +86,12 @@ class TileGradients:
         Raises:
             InputError: memory does not suffice for the smallest tiles.
         """
-        share = Share.whole(batch) if share is None else share
+        weight = ranks.total(batch.weight.sum())
         with self.on_threads(batch.weight.device):
             while True:
                 counts = [count.clone() for count in sample_counts(self.objective)]
                 try:
-                    return self.in_tiles_of(self._pixels_in_tile(batch), batch, share, key, backward)
+                    return self.in_tiles_of(self._pixels_in_tile(batch), batch, weight, key, share, backward)
                 except RuntimeError as error:
                     if not is_out_of_memory(error):
                         raise
@@ -107,13 +102,23 @@ class TileGradients:
                     count.copy_(before)
 
     def in_tiles_of(
-        self, num_pixels: int, batch: Batch, share: Share, key: int | Tensor, backward: Backward = torch_backward
+        self,
+        num_pixels: int,
+        batch: Batch,
+        weight: Float[Tensor, ""],
+        key: int | Tensor,
+        share: Share | None = None,
+        backward: Backward = torch_backward,
     ) -> StepOutput:
-        """Add a batch's gradients, in tiles of `num_pixels` pixels, without handling memory errors."""
+        """Add a batch's gradients, in tiles of `num_pixels` pixels, without handling memory errors.
+
+        `weight` is the sum of the weights of all shares of the step's batch.
+        """
+        share = Share(0, batch.num_rays) if share is None else share
         objective, device = self.objective, batch.weight.device
         random = batch_random(key, batch.num_rays, device, share.first) if self.jitter else None
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
-        weight_scale = share.num_rays / share.weight.clamp(min=1.0)
+        weight_scale = share.num_rays / weight.clamp(min=1.0)
 
         def lose(tile: slice) -> StepOutput:
             # Learned cameras are evaluated in each tile, since its backward pass ends in them.
