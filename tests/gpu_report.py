@@ -4,7 +4,7 @@
     python tests/gpu_report.py steps|memory [fast ...]
 
 `kernels`: registers, bytes that no register had room for, and bytes of shared memory of each of triton's kernels, as it
-compiles them ahead of time for a step and a tile of model=fast and fast_proposal. `steps`: operations, bytes and
+compiles them ahead of time for a step and a tile of a few models. `steps`: operations, bytes and
 arithmetic of a step at the batch of each model, counted on a stand-in, and the least time that they take on a few GPUs.
 `memory`: what training a model takes in all, and the largest batches for GPUs of 8, 12 and 24 GB.
 """
@@ -25,7 +25,7 @@ from support.stand_in_device import StandInDevice
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 
 OTHERS = ("auto", "view_transformer", "view_transformer_tiny")
-COMPILED = ("fast", "fast_proposal")
+COMPILED = ("fast", "fast_large", "fast_proposal")
 SHARES = (1 / 64, 1 / 32)
 """Of a batch, which are counted: what a step asks for is a constant and a part that grows with the batch."""
 CARDS = {"T4": (320, 8), "RTX 3060": (360, 25), "RTX 4090": (1008, 165), "A100": (1555, 312), "H100": (3350, 989)}

@@ -268,16 +268,19 @@ def check_render(kernels, device, generator, rays):
 def check_field(kernels, device, generator, rays):
     """Both MLPs in one pass against each by itself, which rounds the same numbers to bfloat16, but for gradients."""
     few = max(1, rays // 5)
-    for samples_of, count, colored, contracted, whole_from, slope in (
-        (some_dense_samples, few, True, True, 3.0, 0.003),
-        (some_ragged_samples, few, True, False, 0.0, 0.0),
-        (some_ragged_samples, 1, False, False, 0.0, 0.0),
-        (some_ragged_samples, 0, True, False, 0.0, 0.0),
+    for samples_of, count, color_layers, contracted, whole_from, slope in (
+        (some_dense_samples, few, 1, True, 3.0, 0.003),
+        (some_ragged_samples, few, 1, False, 0.0, 0.0),
+        (some_dense_samples, few, 2, False, 0.0, 0.0),
+        (some_ragged_samples, few, 2, True, 3.0, 0.003),
+        (some_ragged_samples, 1, 0, False, 0.0, 0.0),
+        (some_ragged_samples, 0, 1, False, 0.0, 0.0),
+        (some_ragged_samples, 0, 2, False, 0.0, 0.0),
     ):
         samples = samples_of(device, generator, count, padding=300 if count else 0)
         field = NGPField(
-            HashGridEncoder(4, 4, 8, 4, 32), SphericalHarmonicsEncoder(), width=32, feature_dim=12, color_layers=1,
-            contraction=contracted,
+            HashGridEncoder(4, 4, 8, 4, 32), SphericalHarmonicsEncoder(), width=32, feature_dim=12,
+            color_layers=max(1, color_layers), contraction=contracted,
         )  # fmt: skip
         for parameter in field.parameters():
             parameter.data.uniform_(-0.5, 0.5, generator=generator)
@@ -285,7 +288,7 @@ def check_field(kernels, device, generator, rays):
         field.least_slope = slope
         field.to(device)
         bundle = some_rays(generator, count).to(device)
-        parts = field.parts() if colored else replace(field.parts(), color_weights=[])
+        parts = field.parts() if color_layers else replace(field.parts(), color_weights=[])
         (found, gradients), (expected, others) = (
             rendered_with(fused, field, parts, bundle, samples, whole_from) for fused in (kernels, None)
         )
@@ -293,8 +296,8 @@ def check_field(kernels, device, generator, rays):
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=2e-3, atol=2e-4)
         for one, other in zip(gradients, others, strict=True):
-            assert float((one - other).norm()) <= 1e-2 * float(other.norm()), (one.shape, colored)  # bfloat16: 2^-8
-    assert not kernels.takes((32, 64, 16), (32, 64, 64, 3), torch.device(device))
+            assert float((one - other).norm()) <= 1e-2 * float(other.norm()), (one.shape, color_layers)  # 2^-8
+    assert not kernels.takes((32, 64, 16), (32, 64, 64, 64, 3), torch.device(device))
     assert not kernels.takes((32, 128, 16), (32, 64, 3), torch.device(device))
 
 

@@ -16,6 +16,7 @@ BUDGETS = {
     # On the device (operations and kernels): a step, one that is replayed beside its replay, a rendered tile. On the
     # host: a step; two of these pin the numbers of its batch and those of Adam.
     "fast,bf16-mixed": (80, 3, 33, 4),
+    "fast_large,bf16-mixed": (81, 3, 33, 4),
     "fast_proposal,bf16-mixed": (116, 3, 26, 4),
     "nerf_tiny,bf16-mixed": (246, 4, 110, 5),
     "fast,32-true": (97, 3, 40, 4),

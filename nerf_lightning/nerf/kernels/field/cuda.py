@@ -2,8 +2,8 @@
 
 A block of samples goes from its features to density and color without leaving the registers. On the way back there is a
 kernel for each MLP, since the gradients of all weights would not fit into the registers. They compute hidden layers
-again, which is faster than reading them. Products are of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs
-the kernels without a GPU.
+again, which is faster than reading them, but for those of a color with two, for which there are too few registers.
+Products are of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
 import functools
@@ -32,6 +32,7 @@ from nerf_lightning.nerf.kernels.mlp.cuda import (
     padded,
     passed_back,
     rows_of,
+    saved_at,
     store_sum,
     sums_of_programs,
     total,
@@ -79,7 +80,7 @@ def takes(density_widths: tuple[int, ...], color_widths: tuple[int, ...], device
 
     Elsewhere the kernels of the single MLPs do.
     """
-    if len(density_widths) != 3 or len(color_widths) not in (0, 3) or max(*density_widths, *color_widths) > WIDEST:
+    if len(density_widths) != 3 or len(color_widths) not in (0, 3, 4) or max(*density_widths, *color_widths) > WIDEST:
         return False
     shared = color_widths[0] - density_widths[-1] if color_widths else 0
     if shared < 0:
@@ -94,8 +95,8 @@ def takes(density_widths: tuple[int, ...], color_widths: tuple[int, ...], device
     how, of_ray = Activations(0.0, 0.0, 0.0, boxed=True), torch.zeros(1, shared, device=device)
     weights = of_ray, where, density_weights, color_weights, how
     try:
-        density, rgb, hidden = forward(features, *weights, keep=True)
-        backward(density, rgb, hidden, features, *weights)
+        density, rgb, kept = forward(features, *weights, keep=True)
+        backward(density, rgb, kept, features, *weights)
     except OutOfResources:
         return False
     return True
@@ -109,8 +110,8 @@ def forward(
     color_weights: Sequence[Tensor],
     how: Activations,
     keep: bool,
-) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"], BFloat16[Tensor, "saved hidden"]]:
-    """Return density, color, and the density MLP's outputs if they are kept; zeros from sample `used` on.
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"], tuple[Tensor, Tensor]]:
+    """Return density, color, and what `backward` reads if it is kept; zeros from sample `used` on.
 
     Rounded up to a block: a program whose samples are all padding computes nothing.
 
@@ -119,29 +120,31 @@ def forward(
         shared: what the samples of a ray share: inputs of the color after the density MLP's outputs.
         where: the samples.
         density_weights: of two layers.
-        color_weights: of two; none: black.
+        color_weights: of two or three; none: black.
         how: activations.
         keep: whether there will be a backward pass.
     """
     count = features.shape[0]
     density = torch.empty(count, device=features.device)
     rgb = density.new_empty(count, 3)
-    keep = keep and bool(color_weights)
-    hidden = density.new_empty(count if keep else 0, density_weights[-1].shape[0], dtype=torch.bfloat16)
+    rows, deep = count if keep and color_weights else 0, len(color_weights) == 3
+    # The density MLP's outputs, and both hidden layers of a color that has two.
+    hidden = density.new_empty(rows, density_weights[-1].shape[0], dtype=torch.bfloat16)
+    layers = hidden.new_empty(rows if deep else 0, sum(padded(each.shape[0]) for each in color_weights[:-1]))
     if count:
-        arrays = features, shared.contiguous(), where.ray_index, where.points, *_four(density_weights, color_weights)
-        flags = how.boxed, keep, bool(color_weights), where.each, BLOCK, INTERPRETED
+        arrays = features, shared.contiguous(), where.ray_index, where.points, *_five(density_weights, color_weights)
+        flags = how.boxed, bool(rows), bool(color_weights), deep, where.each, BLOCK, INTERPRETED
         _forward[(triton.cdiv(count, BLOCK),)](
-            *arrays, density, rgb, hidden, how.bias, LARGEST_RAW, where.used, count,
+            *arrays, density, rgb, hidden, layers, how.bias, LARGEST_RAW, where.used, count,
             *_sizes(density_weights, color_weights, shared), *flags, **FORWARD,
         )  # fmt: skip
-    return density, rgb, hidden
+    return density, rgb, (hidden, layers)
 
 
 def backward(
     of_density: Float[Tensor, "samples"],
     of_rgb: Float[Tensor, "samples 3"],
-    hidden: BFloat16[Tensor, "saved hidden"],
+    kept: tuple[Tensor, Tensor],
     features: BFloat16[Tensor, "samples features"],
     shared: Float[Tensor, "rays shared"],
     where: Samples,
@@ -151,24 +154,25 @@ def backward(
 ) -> tuple[BFloat16[Tensor, "samples features"], list[Tensor]]:
     """Return the gradients of the features, and of all weights.
 
-    `hidden` is what `forward` returned for the other arguments.
+    `kept` is what `forward` returned for the other arguments.
     """
     count, sizes = features.shape[0], _sizes(density_weights, color_weights, shared)
+    hidden, layers = kept
     of_features, of_hidden = torch.empty_like(features), torch.empty_like(hidden)
     numbers = how.whole_from, where.used, count, *sizes, how.whole_from > 0
     options = where.each, BACKWARD_BLOCK, INTERPRETED
     of_color: list[Tensor] = []
     if color_weights:
         rows, own = color_weights[0].shape[0], hidden.shape[1]
-        shapes: list[tuple[int, ...]] = [(rows, own), (rows, shared.shape[1]), tuple(color_weights[1].shape)]
-        sums = sums_of_programs(shapes, count, features.device)
-        arrays = hidden, shared.contiguous(), *where[:3], *_four(density_weights, color_weights)[2:], of_hidden, sums
-        _backward_color[(len(sums),)](of_rgb.contiguous(), *arrays, how.least_slope, *numbers, *options, **BACKWARD)
-        of_own, of_shared, of_last = total(sums, shapes)
-        of_color = [torch.cat([of_own, of_shared], dim=1), of_last]
+        shapes = [(rows, own), (rows, shared.shape[1]), *(tuple(weight.shape) for weight in color_weights[1:])]
+        sums, weights = sums_of_programs(shapes, count, features.device), _five(density_weights, color_weights)[2:]
+        arrays = hidden, layers, shared.contiguous(), *where[:3], *weights, of_hidden, sums, how.least_slope, *numbers
+        _backward_color[(len(sums),)](of_rgb.contiguous(), *arrays, len(color_weights) == 3, *options, **BACKWARD)
+        of_own, of_shared, *of_others = total(sums, shapes)
+        of_color = [torch.cat([of_own, of_shared], dim=1), *of_others]
     shapes = [tuple(weight.shape) for weight in density_weights]
     sums = sums_of_programs(shapes, count, features.device)
-    arrays = of_hidden, features, *where[:4], *_four(density_weights, color_weights)[:2], of_features, sums
+    arrays = of_hidden, features, *where[:4], *_five(density_weights, color_weights)[:2], of_features, sums
     flags = bool(color_weights), how.boxed
     _backward_density[(len(sums),)](
         of_density.contiguous(), *arrays, how.bias, LARGEST_SLOPE_RAW, *numbers, *flags, *options, **BACKWARD
@@ -188,24 +192,25 @@ def trial(device: str = "cuda") -> None:
     color_weights = [torch.full((16, 32), 0.03125, device=device), torch.full((3, 16), 0.0625, device=device)]
     shared, how = torch.ones(1, 16, device=device), Activations(-1.0, 0.0, 0.0, True)
     given = features, shared, where, density_weights, color_weights, how
-    density, rgb, hidden = forward(*given, keep=True)
-    of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, hidden, *given)
+    density, rgb, kept = forward(*given, keep=True)
+    of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, kept, *given)
     if density.tolist() != [1.0] * 4 or abs(float(rgb[0, 0]) - 0.7310586) > 1e-5:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
     if float(of_features[0, 0]) != 0.0625 or of_weights[1][0].tolist() != [4.0] * 16 or of_weights[1][1].any():
         raise RuntimeError("a trial of its kernels gave wrong gradients")
 
 
-def _four(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor]) -> list[Tensor]:
-    """Return four weights, as the kernels expect; they ignore those that are not there."""
-    return [each.contiguous() for each in (*density_weights, *(color_weights or density_weights))]
+def _five(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor]) -> list[Tensor]:
+    """Return five weights, as the kernels expect: the color's first, second and last; they ignore what is not there."""
+    color = color_weights or density_weights
+    return [each.contiguous() for each in (*density_weights, color[0], color[1], color[-1])]
 
 
 def _sizes(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor], shared: Tensor) -> tuple[int, ...]:
-    """Return the widths of features, density's two layers, what is shared, and color's hidden layer; then padded."""
-    layers = density_weights[0].T, *density_weights, shared.T, *color_weights[:1]
+    """Return the widths of features, density's layers, what is shared, color's first and last hidden; padded, too."""
+    layers = density_weights[0].T, *density_weights, shared.T, *color_weights[:1], *color_weights[-2:-1]
     widths = [each.shape[0] for each in layers]
-    widths += [1] * (5 - len(widths))
+    widths += [1] * (6 - len(widths))
     return *widths, *map(padded, widths)
 
 
@@ -266,15 +271,14 @@ def _outputs_of_density(
 
 @triton.jit
 @no_type_check
-def _outputs_of_color(
-    h, s, c0, c1, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr, d2: tl.constexpr,
-    ds: tl.constexpr, d3: tl.constexpr, widen: tl.constexpr,
+def _first_of_color(
+    h, s, c0, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr,
+    d3: tl.constexpr, widen: tl.constexpr,
 ):  # fmt: skip
-    """Return the hidden layer and the colors of the color MLP, these padded to 16."""
+    """Return the first hidden layer of the color MLP."""
     sums = multiply(h, tl.trans(_first_color_weights(c0, 0, n2, n2 + ns, n3, d2, d3)), widen)
     sums += multiply(s, tl.trans(_first_color_weights(c0, n2, ns, n2 + ns, n3, ds, d3)), widen)
-    y = tl.maximum(sums, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.bfloat16)
-    return y, tl.sigmoid(multiply(y, tl.trans(layer_weights(c1, n3, 3, d3, 16)), widen))
+    return tl.maximum(sums, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.bfloat16)
 
 
 @triton.jit
@@ -311,11 +315,11 @@ def _last(used, count):
 @triton.jit
 @no_type_check
 def _forward(
-    features, shared, ray_index, points, w0, w1, c0, c1, density, rgb, hidden, bias, largest, used, count,
-    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr,
-    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr,
-    boxed: tl.constexpr, keep: tl.constexpr, colored: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
-    widen: tl.constexpr,
+    features, shared, ray_index, points, w0, w1, c0, c1, c2, density, rgb, hidden, layers, bias, largest, used, count,
+    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr, n4: tl.constexpr,
+    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr, d4: tl.constexpr,
+    boxed: tl.constexpr, keep: tl.constexpr, colored: tl.constexpr, deep: tl.constexpr, each: tl.constexpr,
+    block: tl.constexpr, widen: tl.constexpr,
 ):  # fmt: skip
     sample = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
     valid, channel, column = sample < count, tl.arange(0, 16)[None, :], tl.arange(0, d2)[None, :]
@@ -335,41 +339,63 @@ def _forward(
         h, s = out.to(tl.bfloat16), _shared_by_rays(shared, ray_index, sample, valid, ns, ds, each)
         if keep:
             tl.store(hidden + sample[:, None] * n2 + column, h, mask=valid[:, None] & (column < n2))
-        _, color = _outputs_of_color(h, s, c0, c1, n2, ns, n3, d2, ds, d3, widen)
+        y = _first_of_color(h, s, c0, n2, ns, n3, d2, ds, d3, widen)
+        if deep:
+            if keep:
+                tl.store(saved_at(layers, sample, d3 + d4, 0, d3), y, mask=valid[:, None])
+            y = activated(y, c1, n3, n4, d3, d4, widen)
+            if keep:
+                tl.store(saved_at(layers, sample, d3 + d4, d3, d4), y, mask=valid[:, None])
+        color = tl.sigmoid(multiply(y, tl.trans(layer_weights(c2, n4, 3, d4, 16)), widen))
     tl.store(at, color, mask=there)
 
 
 @triton.jit
 @no_type_check
 def _backward_color(
-    of_rgb, hidden, shared, ray_index, starts, ends, c0, c1, of_hidden, sums, least_slope, whole_from, used, count,
-    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr,
-    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr,
-    softened: tl.constexpr, each: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
+    of_rgb, hidden, layers, shared, ray_index, starts, ends, c0, c1, c2, of_hidden, sums, least_slope, whole_from,
+    used, count,
+    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr, n4: tl.constexpr,
+    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr, d4: tl.constexpr,
+    softened: tl.constexpr, deep: tl.constexpr, each: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
 ):  # fmt: skip
     of_own, of_shared = tl.zeros([d3, d2], tl.float32), tl.zeros([d3, ds], tl.float32)
-    of_last = tl.zeros([16, d3], tl.float32)
+    of_last = tl.zeros([16, d4], tl.float32)
+    if deep:
+        of_second = tl.zeros([d4, d3], tl.float32)
     channel, column, last = tl.arange(0, 16)[None, :], tl.arange(0, d2)[None, :], _last(used, count)
     for start in range(tl.program_id(0) * block, last, tl.num_programs(0) * block):
         sample = (start + tl.arange(0, block)).to(tl.int64)
         valid = sample < count
         h, s = rows_of(hidden, sample, count, n2, d2), _shared_by_rays(shared, ray_index, sample, valid, ns, ds, each)
-        y, color = _outputs_of_color(h, s, c0, c1, n2, ns, n3, d2, ds, d3, widen)
+        if deep:
+            z = tl.load(saved_at(layers, sample, d3 + d4, d3, d4), mask=valid[:, None], other=0.0)
+        else:
+            z = _first_of_color(h, s, c0, n2, ns, n3, d2, ds, d3, widen)
+        color = tl.sigmoid(multiply(z, tl.trans(layer_weights(c2, n4, 3, d4, 16)), widen))
         share = _share(ray_index, starts, ends, sample, valid, whole_from, softened, each)
         there = valid[:, None] & (channel < 3)
         of_color = tl.load(of_rgb + 3 * sample[:, None] + channel, mask=there, other=0.0) * share[:, None]
         flowing = (of_color * color_slope(color, of_color, least_slope)).to(tl.bfloat16)
-        of_last += multiply(tl.trans(flowing), y, widen)
-        flowing = passed_back(flowing, y, c1, n3, 3, d3, 16, widen)
+        of_last += multiply(tl.trans(flowing), z, widen)
+        flowing = passed_back(flowing, z, c2, n4, 3, d4, 16, widen)
+        if deep:
+            y = tl.load(saved_at(layers, sample, d3 + d4, 0, d3), mask=valid[:, None], other=0.0)
+            of_second += multiply(tl.trans(flowing), y, widen)
+            flowing = passed_back(flowing, y, c1, n3, n4, d3, d4, widen)
         of_own += multiply(tl.trans(flowing), h, widen)
         of_shared += multiply(tl.trans(flowing), s, widen)
         of_h = multiply(flowing, _first_color_weights(c0, 0, n2, n2 + ns, n3, d2, d3), widen)
         at = of_hidden + sample[:, None] * n2 + column
         tl.store(at, of_h.to(tl.bfloat16), mask=valid[:, None] & (column < n2))
-    own = sums + tl.program_id(0) * (d2 + ds + 16) * d3
+    of_first: tl.constexpr = (d2 + ds) * d3
+    of_others: tl.constexpr = of_first + (d3 * d4 if deep else 0)
+    own = sums + tl.program_id(0) * (of_others + d4 * 16)
     store_sum(own, 0, of_own, d2, d3)
     store_sum(own, d2 * d3, of_shared, ds, d3)
-    store_sum(own, (d2 + ds) * d3, of_last, d3, 16)
+    if deep:
+        store_sum(own, of_first, of_second, d3, d4)
+    store_sum(own, of_others, of_last, d4, 16)
 
 
 @triton.jit
@@ -377,8 +403,8 @@ def _backward_color(
 def _backward_density(
     of_density, of_hidden, features, ray_index, starts, ends, points, w0, w1, of_features, sums, bias, largest,
     whole_from, used, count,
-    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr,
-    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr,
+    n0: tl.constexpr, n1: tl.constexpr, n2: tl.constexpr, ns: tl.constexpr, n3: tl.constexpr, n4: tl.constexpr,
+    d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr, ds: tl.constexpr, d3: tl.constexpr, d4: tl.constexpr,
     softened: tl.constexpr, colored: tl.constexpr, boxed: tl.constexpr, each: tl.constexpr, block: tl.constexpr,
     widen: tl.constexpr,
 ):  # fmt: skip

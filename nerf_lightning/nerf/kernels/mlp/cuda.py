@@ -185,7 +185,8 @@ def rows_of(array, row, count, width: tl.constexpr, padded: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _saved_at(saved, row, words: tl.constexpr, first: tl.constexpr, width: tl.constexpr):
+def saved_at(saved, row, words: tl.constexpr, first: tl.constexpr, width: tl.constexpr):
+    """Return where `width` of the words saved for each row are."""
     return saved + row[:, None] * words + first + tl.arange(0, width)[None, :]
 
 
@@ -219,12 +220,12 @@ def _forward(
     x = rows_of(points, row, count, n0, d0)
     y = activated(x, w0, n0, n1, d0, d1, widen)
     if keep:
-        tl.store(_saved_at(saved, row, words, 0, d0), x, mask=valid)
-        tl.store(_saved_at(saved, row, words, d0, d1), y, mask=valid)
+        tl.store(saved_at(saved, row, words, 0, d0), x, mask=valid)
+        tl.store(saved_at(saved, row, words, d0, d1), y, mask=valid)
     if layers == 3:
         z = activated(y, w1, n1, n2, d1, d2, widen)
         if keep:
-            tl.store(_saved_at(saved, row, words, d0 + d1, d2), z, mask=valid)
+            tl.store(saved_at(saved, row, words, d0 + d1, d2), z, mask=valid)
         sums = multiply(z, tl.trans(layer_weights(w2, n2, n3, d2, d3)), widen)
         column = tl.arange(0, d3)
     else:
@@ -268,15 +269,15 @@ def _backward(
         valid = (row < count)[:, None]
         if layers == 3:
             flowing = rows_of(grad, row, count, n3, d3)
-            z = tl.load(_saved_at(saved, row, words, d0 + d1, d2), mask=valid, other=0.0)
+            z = tl.load(saved_at(saved, row, words, d0 + d1, d2), mask=valid, other=0.0)
             of_2 += multiply(tl.trans(flowing), z, widen)
             flowing = passed_back(flowing, z, w2, n2, n3, d2, d3, widen)
         else:
             flowing = rows_of(grad, row, count, n3, d2)
-        y = tl.load(_saved_at(saved, row, words, d0, d1), mask=valid, other=0.0)
+        y = tl.load(saved_at(saved, row, words, d0, d1), mask=valid, other=0.0)
         of_1 += multiply(tl.trans(flowing), y, widen)
         flowing = passed_back(flowing, y, w1, n1, n2, d1, d2, widen)
-        x = tl.load(_saved_at(saved, row, words, 0, d0), mask=valid, other=0.0)
+        x = tl.load(saved_at(saved, row, words, 0, d0), mask=valid, other=0.0)
         of_0 += multiply(tl.trans(flowing), x, widen)
         if wants_points:
             column = tl.arange(0, d0)

@@ -117,15 +117,15 @@ class _Fused(torch.autograd.Function):
         mlps = [each.detach() for each in weights[:layers]], [each.detach() for each in weights[layers:]]
         ctx.kernels, ctx.arguments = kernels, (shared.detach(), where, *mlps, how)
         keep = any(ctx.needs_input_grad)
-        density, rgb, hidden = kernels.forward(features.detach(), *ctx.arguments, keep)
-        ctx.save_for_backward(features, hidden)
+        density, rgb, kept = kernels.forward(features.detach(), *ctx.arguments, keep)
+        ctx.save_for_backward(features, *kept)
         return density, rgb
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
-        features, hidden = ctx.saved_tensors
-        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, hidden, features, *ctx.arguments)
+        features, *kept = ctx.saved_tensors
+        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, tuple(kept), features, *ctx.arguments)
         return of_features, None, None, None, None, None, *of_weights
 
 
