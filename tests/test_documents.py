@@ -286,14 +286,34 @@ return [...document.querySelectorAll("table.docutils")]
 
 @pytest.mark.minutes
 def test_tables_fit_into_the_page_and_formulas_wrap_or_scroll_in_their_own_boxes(site):
+    tables = ("settings", "article", "architecture", "defaults", "lego_limits", "splats", "photographs", "page")
     with opened((site / "index.html").as_uri()) as driver:
-        for page in ("settings", "article", "capture_formats", "measurements", "method", "course_2_rays"):
+        for page in (*tables, "capture_formats", "measurements", "method", "course_2_rays"):
             driver.get((site / f"{page}.html").as_uri())
             for size in ("desktop", "phone"):
                 layout_faults(driver, size)
                 assert driver.execute_script(WIDE_TABLES) == [], (page, size)
             if page in ("method", "course_2_rays"):
                 assert driver.execute_script(FORMULAS) == [], page
+
+
+NAMES = """
+const names = [...document.querySelectorAll("td code")].filter(code => /^\\S{1,36}$/.test(code.textContent));
+const broken = names.filter(name => name.getClientRects().length > 1).map(name => name.textContent);
+const untitled = [...document.querySelectorAll("table.wide td:first-child")].filter(title => !title.innerText.trim());
+return [broken, untitled.map(title => title.parentElement.innerText)];
+"""
+
+
+@pytest.mark.minutes
+@pytest.mark.parametrize("page", ["article", "architecture", "defaults", "lego_limits"])
+def test_names_in_tables_do_not_break_and_stacked_rows_have_titles(site, page):
+    with opened((site / f"{page}.html").as_uri()) as driver:
+        for size in ("desktop", "phone"):
+            layout_faults(driver, size)
+            broken, untitled = driver.execute_script(NAMES)
+            assert broken == [], size
+            assert untitled == [], size
 
 
 PICTURES = """

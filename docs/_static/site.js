@@ -1,17 +1,25 @@
 /* Where long code may break, which tables do not fit into the page (site.css stacks their rows on phones), captions. */
-const LONG = {td: 24, "": 36}; // Shorter words of code (characters) stay whole, in tables and elsewhere: a line of a phone.
+const LONG = 36; // Shorter words of code (characters) stay whole: a line of a phone.
+const LONG_IN_FULL_TABLES = 24; // The same in tables that do not fit into the page otherwise.
 const SHORT = 12; // Characters of cells that share a line where rows are stacked.
-const NUMBER = /^[-+~]?[\d.,]*\d( ?(%|[a-zA-Z/]{1,6}))?$/;
-const LABELED = 4; // Rows of fewer columns need no names of columns.
+const NUMBER = /^([-+~]?[\d.,]*\d(\s?(%|[a-zA-Z/]{1,6}))?(, | to |$))+$/; // also several
+const LABELED = 3; // Rows of fewer columns need no names of columns: site.css shows them once, above.
 const tables = [...document.querySelectorAll("table.docutils")];
 const columns = table => [...table.querySelectorAll("thead th")].map(cell => cell.textContent.trim());
 const tooWide = table => table.scrollWidth > table.parentElement.clientWidth;
 
-function mayBreak(text, long) {
+function mayBreak(text) {
   text.replaceWith(...text.data.split(/(?<=\s)(?=\S)/).flatMap(word => {
-    const parts = word.length > long ? word.split(/(?<=[/._=,:@])(?=\w{3})/) : [word];
-    return parts.flatMap((part, number) => (number ? [document.createElement("wbr"), part] : [part]));
+    const parts = word.length > LONG_IN_FULL_TABLES ? word.split(/(?<=[/._=,:@])(?=\w{3})/) : [word];
+    const chance = () => Object.assign(document.createElement("wbr"), {className: word.length > LONG ? "" : "if-wide"});
+    return parts.flatMap((part, number) => (number ? [chance(), whole(part)] : [whole(part)]));
   }));
+}
+
+// Browsers break after hyphens and before brackets.
+function whole(part) {
+  if (part.length > LONG || !/[-[({]/.test(part)) return part;
+  return Object.assign(document.createElement("span"), {className: "short", textContent: part});
 }
 
 function markWide() {
@@ -40,10 +48,10 @@ for (const pre of document.querySelectorAll(".highlight pre")) {
 }
 
 for (const code of document.querySelectorAll("code.literal, .highlight pre")) {
-  code.classList.toggle("short", code.matches(".literal") && code.textContent.length <= LONG.td);
-  const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [], long = LONG[code.closest("td") ? "td" : ""];
+  code.classList.toggle("short", code.matches(".literal") && code.textContent.length <= LONG_IN_FULL_TABLES);
+  const walk = document.createTreeWalker(code, NodeFilter.SHOW_TEXT), texts = [];
   while (walk.nextNode()) texts.push(walk.currentNode);
-  texts.filter(text => text.length > long).forEach(text => mayBreak(text, long));
+  texts.filter(text => text.length > LONG_IN_FULL_TABLES).forEach(mayBreak);
 }
 for (const table of tables) {
   const names = columns(table);
@@ -53,12 +61,15 @@ for (const table of tables) {
   });
   let above = "";
   for (const row of table.querySelectorAll("tbody tr")) {
-    above = row.cells[0].textContent.trim() || above;
+    if (row.cells[0].textContent.trim()) above = row.cells[0].innerHTML;
     [...row.cells].forEach((cell, column) => {
       const blank = !cell.textContent.trim() && !cell.querySelector("img");
       cell.classList.toggle("blank", blank);
       if (blank && column) cell.innerHTML = "<p>\u2013</p>";
-      if (!column && cell.matches(".blank") && above) cell.dataset.above = above;
+      if (blank && !column && above) {
+        cell.innerHTML = above;
+        cell.classList.replace("blank", "above");
+      }
       if ((!column && !NUMBER.test(cell.textContent.trim())) || names.length < LABELED || !names[column]) return;
       cell.dataset.column = names[column];
       cell.classList.toggle("short", cell.textContent.trim().length <= SHORT);
