@@ -95,8 +95,8 @@ def takes(density_widths: tuple[int, ...], color_widths: tuple[int, ...], device
     how, of_ray = Activations(0.0, 0.0, 0.0, boxed=True), torch.zeros(1, shared, device=device)
     weights = of_ray, where, density_weights, color_weights, how
     try:
-        density, rgb, kept = forward(features, *weights, keep=True)
-        backward(density, rgb, kept, features, *weights)
+        density, rgb, saved = forward(features, *weights, keep=True)
+        backward(density, rgb, saved, features, *weights)
     except OutOfResources:
         return False
     return True
@@ -144,7 +144,7 @@ def forward(
 def backward(
     of_density: Float[Tensor, "samples"],
     of_rgb: Float[Tensor, "samples 3"],
-    kept: tuple[Tensor, Tensor],
+    saved: tuple[Tensor, Tensor],
     features: BFloat16[Tensor, "samples features"],
     shared: Float[Tensor, "rays shared"],
     where: Samples,
@@ -154,10 +154,10 @@ def backward(
 ) -> tuple[BFloat16[Tensor, "samples features"], list[Tensor]]:
     """Return the gradients of the features, and of all weights.
 
-    `kept` is what `forward` returned for the other arguments.
+    `saved` is what `forward` returned for the other arguments.
     """
     count, sizes = features.shape[0], _sizes(density_weights, color_weights, shared)
-    hidden, layers = kept
+    hidden, layers = saved
     of_features, of_hidden = torch.empty_like(features), torch.empty_like(hidden)
     numbers = how.whole_from, where.used, count, *sizes, how.whole_from > 0
     options = where.each, BACKWARD_BLOCK, INTERPRETED
@@ -192,8 +192,8 @@ def trial(device: str = "cuda") -> None:
     color_weights = [torch.full((16, 32), 0.03125, device=device), torch.full((3, 16), 0.0625, device=device)]
     shared, how = torch.ones(1, 16, device=device), Activations(-1.0, 0.0, 0.0, True)
     given = features, shared, where, density_weights, color_weights, how
-    density, rgb, kept = forward(*given, keep=True)
-    of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, kept, *given)
+    density, rgb, saved = forward(*given, keep=True)
+    of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, saved, *given)
     if density.tolist() != [1.0] * 4 or abs(float(rgb[0, 0]) - 0.7310586) > 1e-5:
         raise RuntimeError("a trial of its kernels gave wrong numbers")
     if float(of_features[0, 0]) != 0.0625 or of_weights[1][0].tolist() != [4.0] * 16 or of_weights[1][1].any():

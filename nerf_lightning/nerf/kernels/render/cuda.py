@@ -117,15 +117,15 @@ class _Fused(torch.autograd.Function):
         mlps = [each.detach() for each in weights[:layers]], [each.detach() for each in weights[layers:]]
         ctx.kernels, ctx.arguments = kernels, (shared.detach(), where, *mlps, how)
         keep = any(ctx.needs_input_grad)
-        density, rgb, kept = kernels.forward(features.detach(), *ctx.arguments, keep)
-        ctx.save_for_backward(features, *kept)
+        density, rgb, saved = kernels.forward(features.detach(), *ctx.arguments, keep)
+        ctx.save_for_backward(features, *saved)
         return density, rgb
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_density: Tensor, of_rgb: Tensor) -> tuple[Tensor | None, ...]:
-        features, *kept = ctx.saved_tensors
-        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, tuple(kept), features, *ctx.arguments)
+        features, *saved = ctx.saved_tensors
+        of_features, of_weights = ctx.kernels.backward(of_density, of_rgb, tuple(saved), features, *ctx.arguments)
         return of_features, None, None, None, None, None, *of_weights
 
 
