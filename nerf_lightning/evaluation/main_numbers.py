@@ -35,7 +35,8 @@ def main_numbers(metrics: dict[str, Any], note: dict[str, Any]) -> list[tuple[st
     ]
     count, of = number(metrics.get("num_images")), number(metrics.get("split_views"))
     if count is not None and of is not None:
-        shown.append(("views measured", f"{count:,.0f}" if count == of else f"{count:,.0f} of {of:,.0f}"))
+        label = "test views" if mapping(metrics.get("protocol")).get("split") == "test" else "views measured"
+        shown.append((label, f"{count:,.0f}" if count == of else f"{count:,.0f} of {of:,.0f}"))
     origin = mapping(metrics.get("origin"))
     trained = number(note.get("training_seconds"))
     shown.append(("training", "" if trained is None else spoken(trained)))

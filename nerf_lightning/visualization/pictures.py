@@ -25,6 +25,8 @@ LONGEST_PANEL = 1600
 """Approximate maximum length in pixels of the longer side of a panel of the validation picture: a row of four
 photographs would be larger than any display."""
 
+CAPTIONS = {"truth": "photograph", "true_depth": "true depth", "error": "color error"}
+"""Of panels, where their names differ."""
 PAPER = 255
 DARK, LIGHT = 24, (225, 225, 225)
 _INK = (64, 64, 64)
@@ -121,7 +123,10 @@ def depth_picture(
     for rows in row_chunks(*depth.shape):
         colors = color_map(depth[rows], low=far, high=near)
         picture[rows] = to_bytes(colors if opacity is None else faded(colors, opacity[rows]))
-    return _with_scale(picture, f"near {near:.3g}", f"far {far:.3g}", scale_inside)
+    ends = f"{near:.3g}", f"{far:.3g}"
+    if not scale_inside:  # Inside, letters cover a part of the picture.
+        ends = f"near {ends[0]}", f"far {ends[1]}"
+    return _with_scale(picture, *ends, scale_inside)
 
 
 def faded(
@@ -167,9 +172,9 @@ def panels(
 
 def mosaic(named: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> UInt8[Tensor, "taller wider 3"]:
     """Return panels in a row, with a caption above each; large ones are shrunk (`at_most`)."""
-    small = [(name, at_most(panel)) for name, panel in named]
+    small = [(CAPTIONS.get(name, name), at_most(panel)) for name, panel in named]
     size = letter_size(small[0][1].shape[0])
-    return framed(side_by_side([with_caption(panel, name, size) for name, panel in small], gap=size), size)
+    return framed(side_by_side([with_caption(panel, caption, size) for caption, panel in small], gap=size), size)
 
 
 def framed(picture: UInt8[Tensor, "height width 3"], size: int) -> UInt8[Tensor, "taller wider 3"]:
@@ -223,7 +228,7 @@ def _with_scale(
     if not inside:
         return torch.cat([picture, _scale(picture.shape[0], size, top, bottom)], dim=1)
     margin = (0, 0, 0, 0, size // 3, size // 3)
-    scale = torch.nn.functional.pad(_scale(4 * size, size, top, bottom, DARK, LIGHT), margin, value=DARK)
+    scale = torch.nn.functional.pad(_scale(5 * size // 2, size, top, bottom, DARK, LIGHT), margin, value=DARK)
     if scale.shape[0] <= picture.shape[0] // 2 and scale.shape[1] <= picture.shape[1] // 2:
         picture[: scale.shape[0], -scale.shape[1] :] = scale
     return picture

@@ -87,7 +87,7 @@ def _result(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> tupl
     """Return the result in a sentence with what would improve it most, and, if that is training, how long."""
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
-    quality = "" if psnr is None else f"PSNR {psnr:.1f} dB on held-out {what}; "
+    quality = "" if psnr is None else f"PSNR {psnr:.1f} dB on {job.config.evaluation.split} views; "
     length = (
         f"trainer.max_steps={2 * steps}" if seconds is None else f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
     )

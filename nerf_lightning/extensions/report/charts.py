@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +12,14 @@ MOST_CURVES = 12
 DIGITS = 5
 MOST_EQUAL = 3  # Names of one curve
 LEVEL = "gradients/norm_"
-"""Begins the tag of a curve of each level of the model."""
+"""Begins the tag of a curve of each level of the model; sums of the loss over a level are not drawn."""
+WORDS = {
+    "color": "color error",
+    "depth": "depth error",
+    "distortion": "spread along rays (distortion)",
+    "interlevel": "misplaced samples (interlevel)",
+}
+"""Terms of the loss in plain words."""
 LARGEST_STEP = 10**12
 """An untrusted file may number steps beyond what a script can count."""
 
@@ -39,15 +46,14 @@ CHARTS = (
         "PSNR (dB)",
         re.compile(r"PSNR/(train_\w{1,40}|validation)"),
         is_noisy=True,
-        note="Training: the rays of a step. Validation: some rays of the held-out views, always the same.",
+        note="Training: the rays of a step. Validation: some rays of views not used for training, always the same.",
     ),
     Chart(
         "Training loss",
         re.compile(r"Training loss/(\w{1,40})"),
         is_logarithmic=True,
         is_noisy=True,
-        note="Weighted terms (color: its error; distortion, interlevel: shape of the weights along rays), their sums "
-        "over each level of the model, and the sum of all.",
+        note="What training minimizes: each term times its weight, and their sum.",
     ),
     Chart("Learning rate", re.compile(r"train/(learning_rate)"), is_logarithmic=True),
     Chart("Rays per second", re.compile(r"speed/(rays_per_second)"), is_noisy=True, from_zero=True),
@@ -72,10 +78,14 @@ def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
     """Return the charts that there is something to draw in: a curve of at least two points."""
     drawings = []
     for chart in CHARTS:
-        matched = {tag: match[1] for tag in sorted(curves) if (match := chart.tags.fullmatch(tag))}
-        labels = _labels(matched, curves)
+        matched = {
+            tag: match[1]
+            for tag in sorted(curves)
+            if (match := chart.tags.fullmatch(tag)) and f"{LEVEL}{match[1]}" not in curves
+        }
+        labels = _labels(matched)
         finite = {tag: _finite(curves[tag], chart) for tag in matched}
-        # Equal curves, such as a level's loss of one term, would hide each other.
+        # Equal curves, such as the only term of a loss and the sum, would hide each other.
         equal: dict[tuple[Any, ...], list[str]] = {}
         for tag, (steps, values) in finite.items():
             if len(steps) > 1:
@@ -93,12 +103,12 @@ def drawn(curves: Mapping[str, Curve]) -> list[Drawing]:
     return drawings
 
 
-def _labels(names: Mapping[str, str], curves: Iterable[str]) -> dict[str, str]:
+def _labels(names: Mapping[str, str]) -> dict[str, str]:
     """Return what each curve is called: `train_fine` is "training", or, of several levels, "training (fine)"."""
     levels = [name for name in names.values() if name.startswith("train_")]
     called = {name: "training" if len(levels) == 1 else f"training ({name[6:]})" for name in levels}
-    called |= {tag[len(LEVEL) :]: f"{tag[len(LEVEL) :]} level" for tag in curves if tag.startswith(LEVEL)}
-    return {tag: called.get(name, name.removeprefix("photo_").replace("_", " ")) for tag, name in names.items()}
+    plain = {tag: name.removeprefix("photo_") for tag, name in names.items()}
+    return {tag: called.get(name) or WORDS.get(name, name.replace("_", " ")) for tag, name in plain.items()}
 
 
 def _finite(curve: Curve, chart: Chart) -> Curve:

@@ -70,7 +70,9 @@ def _positions(scene: SceneRecord) -> CoverageMap:
 
 
 def _dots(scene: SceneRecord, x: torch.Tensor, y: torch.Tensor) -> list[tuple[str, str, list[Dot]]]:
-    labels = {"train": "training", "held out": "held out"}
+    val, test = (scene.splits.get(name, ()) for name in ("val", "test"))
+    kinds = ("validation" if val != test else "", "test" if test else "")
+    labels = {"train": "training", "held out": " and ".join(filter(None, kinds))}
     return [
         (
             f"{labels[split]} ({len(views)})",

@@ -24,7 +24,7 @@ ROWS = {
     ("protocol", "masks"): "masked pixels",
     ("protocol", "downscale"): "photographs shrunk by",
     ("protocol", "filter"): "filter when shrinking",
-    ("protocol", "hold_every"): "held out: one view in",
+    ("protocol", "hold_every"): "test views: one in",
     ("origin", "config"): "fingerprint of the config",
     ("origin", "checkpoint"): "fingerprint of the weights",
     ("origin", "commit"): "commit of the code",
@@ -112,7 +112,7 @@ def depth_scale(metrics: dict[str, Any]) -> str:
     near, far = number(scale.get("near")), number(scale.get("far"))
     if near is None or far is None:
         return ""
-    return f"bright: {near:.3g}, dark: {far:.3g} ({str(scale.get('unit', ''))[:40]})"
+    return f"bright: {near:.3g} or nearer, black: {far:.3g} or farther ({str(scale.get('unit', ''))[:40]})"
 
 
 def _name(key: str) -> str:

@@ -1,7 +1,7 @@
 "use strict";
 
 // A slider through pictures: one of them is shown.
-for (const figure of document.querySelectorAll(".steps")) {
+for (const figure of document.querySelectorAll(".steps:has(input)")) {
   const pictures = figure.querySelectorAll("img");
   const slider = figure.querySelector("input");
   const label = figure.querySelector("output");
@@ -46,7 +46,7 @@ if (depth) {
 const COLORS = [
   "#2f6db3", "#c2560a", "#1f7f4f", "#8b4fbf", "#c3203f", "#5d6673", "#0a7c8c", "#7a4a1e", "#d01fa8", "#6c7200", "#1b1f8a", "#000000",
 ];
-const HEIGHT = 260, LEFT = 56, RIGHT = 10, TOP = 8, BOTTOM = 34, SMOOTHING = 0.9;
+const HEIGHT = 260, LEFT = 56, RIGHT = 18, TOP = 8, BOTTOM = 34, SMOOTHING = 0.9;
 
 function put(parent, name, attributes, text = "") {
   const made = document.createElementNS("http://www.w3.org/2000/svg", name);

@@ -25,37 +25,22 @@ LONGEST_SIDE = 1600
 LOSSLESS_PIXELS = 1 << 18
 """Up to 512 x 512 pixels are kept exactly, larger pictures at `QUALITY`."""
 QUALITY = 92
-SMALL = 300
 
 
-@dataclass(frozen=True)
-class Embedded:
-    """A picture in a page."""
-
-    source: str
-    width: int
-
-    @property
-    def is_small(self) -> bool:
-        """Return whether it is shown larger than it is, where blurring would hide what is to be judged."""
-        return self.width < SMALL
-
-
-def embedded_file(path: Path) -> Embedded:
+def embedded_file(path: Path) -> str:
     """Return a picture file, decoded and encoded anew: nothing of the file but its pixels comes into the page."""
     return embedded(read_rgba(path)[..., :3])
 
 
-def embedded(picture: UInt8[np.ndarray, "height width 3"]) -> Embedded:
-    """Return a picture as WebP, shrunk where it is larger than a page."""
+def embedded(picture: UInt8[np.ndarray, "height width 3"]) -> str:
+    """Return a picture as the address of a WebP, shrunk where it is larger than a page."""
     image = Image.fromarray(np.ascontiguousarray(picture))
-    width = image.width
     if max(image.size) > LONGEST_SIDE:
         image.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
     lossless = image.width * image.height <= LOSSLESS_PIXELS
     buffer = io.BytesIO()
     image.save(buffer, format="WEBP", lossless=lossless, quality=QUALITY)
-    return Embedded(data_address("image/webp", buffer.getvalue()), width)
+    return data_address("image/webp", buffer.getvalue())
 
 
 def embedded_video(path: Path, most_bytes: int) -> str:
@@ -76,11 +61,12 @@ class ViewOnPage:
 
     name: str
     numbers: str
-    truth: Embedded
-    render: Embedded
-    depth: Embedded
-    error: Embedded
-    true_depth: Embedded | None = None
+    truth: str
+    """The pictures' addresses."""
+    render: str
+    depth: str
+    error: str
+    true_depth: str | None = None
 
 
 @dataclass
@@ -101,6 +87,8 @@ class Report:
     """The command that improves it; empty: none does."""
     facts: Pairs = field(default_factory=list)
     """The main numbers: label and value."""
+    meanings: str = ""
+    """What the main numbers mean."""
     more_facts: Pairs = field(default_factory=list)
     """Further numbers, folded."""
     missing: list[str] = field(default_factory=list)
@@ -109,8 +97,8 @@ class Report:
     """What the brightest and the darkest color of depth stand for; empty: unknown."""
     worst: list[ViewOnPage] = field(default_factory=list)
     views: list[ViewOnPage] = field(default_factory=list)
-    steps: list[tuple[str, Embedded]] = field(default_factory=list)
-    """Pictures of one view during training."""
+    steps: Pairs = field(default_factory=list)
+    """Pictures of one view during training: label and address."""
     charts: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)

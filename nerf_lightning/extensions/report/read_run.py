@@ -25,8 +25,15 @@ from nerf_lightning.runs.file_steps import exported_files, read_steps
 from nerf_lightning.runs.summary import read_note, scene_of_run
 
 MOST_STEPS = 24
-MAIN = ("PSNR (mean)", "SSIM", "LPIPS", "views measured", "training")
-"""Labels of the numbers that are not folded."""
+MAIN = {
+    "test views": "Test views were not used for training.",
+    "PSNR (mean)": "PSNR: color error on a logarithmic scale; higher is better, and 6 dB more is half the error.",
+    "SSIM": "SSIM: similarity of local structure; 1 is identical.",
+    "LPIPS": "LPIPS: visible difference, as a neural network judges it; 0 is identical.",
+    "views measured": "",
+    "training": "",
+}
+"""Labels of the numbers that are not folded, and what these mean; "": the label says it."""
 SPLITS = {"train": "training", "val": "validation", "test": "test"}
 MOST_EXPORTS = 20
 PAGE_AGE = "Exported at step {step:,}; training has reached step {last:,}."
@@ -76,7 +83,9 @@ def read_run(
         _add_exports(report, run / "export", (folder or run).absolute(), step)
         for picture in _validation_pictures(run):
             with attempt("A picture of the validation"):
-                report.steps.append((f"step {picture.stem.partition('_')[2].lstrip('0')}", embedded_file(picture)))
+                taken = int(_step_of(picture))
+                label = _age(taken, step) or f"step {taken:,}"
+                report.steps.append((label, embedded_file(picture)))
         with attempt("Config"):
             _add_config(report, run)
         progress("curves", 0.0)
@@ -130,6 +139,7 @@ def _add_measured(report: Report, run: Path, file: Path, resume: str) -> None:
     report.command = _resume_command(resume, str(note.get("resume_with", ""))[:LONGEST_RESULT])
     known = main_numbers(metrics, note)
     report.facts = [pair for pair in known if pair[0] in MAIN]
+    report.meanings = " ".join(said for label, said in MAIN.items() if said and label in dict(known))
     report.more_facts = [pair for pair in known if pair[0] not in MAIN]
     report.columns, report.per_image = per_image(metrics)
     report.split = str(mapping(metrics.get("protocol")).get("split", "test"))[:20]
@@ -151,9 +161,13 @@ def _resume_command(resume: str, settings: str) -> str:
     return " ".join(["nerf train", resume, *map(shlex.quote, words)]) if resume and words else ""
 
 
+def _step_of(picture: Path) -> str:
+    return picture.stem.removeprefix("step_")
+
+
 def _validation_pictures(run: Path) -> list[Path]:
     """Return the files in the order of their steps; of very many, an even choice with the last."""
-    files = sorted((run / "images" / "validation").glob("step_*.png"))
+    files = sorted(file for file in (run / "images" / "validation").glob("step_*.png") if _step_of(file).isdecimal())
     if len(files) <= MOST_STEPS:
         return files
     return sorted(files[-1 - i * len(files) // MOST_STEPS] for i in range(MOST_STEPS))

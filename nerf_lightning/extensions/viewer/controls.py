@@ -107,12 +107,15 @@ class Controls:
                 label = f"{axis}: {lower:g} to {upper:g}"
                 sliders.append(self.gui.add_multi_slider(label, lower, upper, least, (lower, upper), min_range=least))
 
+        whole = tuple(zip(*(slider.value for slider in sliders), strict=True))
+
         def update(_: Any) -> None:
             for axis, slider in zip("xyz", sliders, strict=True):
                 slider.label = f"{axis}: {slider.value[0]:g} to {slider.value[1]:g}"
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
-            self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
-            self.frusta.draw_box(self.session.crop)
+            box = CropBox.from_user(lower, upper, record.to_user)
+            self.session.crop = box if on.value else None
+            self.frusta.draw_box(box if on.value or (lower, upper) != whole else None)
             self.session.request_view()
 
         for each in (on, *sliders):

@@ -63,12 +63,8 @@ class Frusta:
             self.box.remove()
             self.box = None
         if box is not None:
-            from viser.transforms import SO3
-
-            turned = SO3.from_matrix(box.axes.mT.double().numpy()).wxyz
-            middle = (box.corner + 0.5 * box.size @ box.axes).double().numpy()
-            size = tuple(box.size.tolist())
-            self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
+            ends = box_edges(box).double().numpy()
+            self.box = self.scene.add_line_segments(BOX, ends, BLUE, thickness=2.0, thickness_units="screen")
         self.session.draw_over("crop box", box is not None)
 
     def draw_path(self, path: RecordedPath) -> None:
@@ -121,6 +117,13 @@ class Frusta:
         shadows = {"cast_shadow": False, "receive_shadow": False}
         place = {"wxyz": quaternion_of(c2w), "position": c2w[:, 3].double().numpy()}
         return self.scene.add_camera_frustum(name, fov, aspect, **look, **shadows, **place)
+
+
+def box_edges(box: CropBox) -> Float[Tensor, "12 2 3"]:
+    """Return the ends of a box's edges (scene units)."""
+    corners = torch.cartesian_prod(*torch.tensor([[0.0, 1.0]] * 3))
+    edges = [(a, b) for a in corners for b in corners if (b - a).sum() == 1 and (b - a).min() == 0]
+    return box.corner + torch.stack([torch.stack(edge) for edge in edges]) * box.size @ box.axes
 
 
 def frustum_size(places: Float[Tensor, "cameras 3"], radius: float) -> float:

@@ -16,8 +16,8 @@ from nerf_lightning.extensions.report.metrics import WITHOUT_LPIPS, depth_scale,
 from nerf_lightning.extensions.report.page import LONGEST_SIDE, Report, embedded, embedded_file, write_report
 
 
-def decoded(picture):
-    content = base64.b64decode(picture.source.removeprefix("data:image/webp;base64,"))
+def decoded(address):
+    content = base64.b64decode(address.removeprefix("data:image/webp;base64,"))
     return np.asarray(Image.open(io.BytesIO(content)))
 
 
@@ -25,14 +25,12 @@ def test_small_pictures_are_kept_exactly_large_ones_shrunk_and_nothing_of_a_file
     random = np.random.default_rng(0)
     picture = random.integers(0, 256, (30, 40, 3), dtype=np.uint8)
     assert (decoded(embedded(picture)) == picture).all()
-    assert embedded(picture).is_small
     wide = embedded(np.zeros((10, 2 * LONGEST_SIDE, 3), dtype=np.uint8))
     assert decoded(wide).shape == (5, LONGEST_SIDE, 3)
-    assert not wide.is_small
     path = tmp_path / "a.png"
     Image.new("RGB", (8, 8), "red").save(path)
     path.write_bytes(path.read_bytes() + b"planted behind the end")
-    content = base64.b64decode(embedded_file(path).source.partition(",")[2])
+    content = base64.b64decode(embedded_file(path).partition(",")[2])
     assert b"planted" not in content
 
 
@@ -55,12 +53,12 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
     assert drawn({}) == []
 
 
-def test_equal_curves_are_drawn_once_under_both_names():
-    losses = {"proposal": 1.0, "photo_interlevel": 1.0, "fine": 2.0}
+def test_equal_curves_are_drawn_once_under_both_names_and_sums_over_levels_are_not():
+    losses = {"fine": 2.0, "photo_color": 1.0, "photo_interlevel": 3.0, "proposal": 3.0, "sum": 1.0}
     curves = {f"Training loss/{name}": ([1, 2], [9.0, end]) for name, end in losses.items()}
     levels = {f"gradients/norm_{name}": ([1], [1.0]) for name in ("proposal", "fine")}
     (drawing,) = drawn(curves | levels)
-    assert [curve["label"] for curve in drawing.curves] == ["fine level", "interlevel = proposal level"]
+    assert [curve["label"] for curve in drawing.curves] == ["color error = sum", "misplaced samples (interlevel)"]
 
 
 @pytest.mark.parametrize("space", ["contracted", "ndc"])
@@ -102,6 +100,7 @@ def test_the_page_says_how_many_views_were_measured_and_what_lpips_needs_where_i
     assert ("LPIPS", WITHOUT_LPIPS) not in dict(tables(protocol | {"lpips": 0.1}))["Protocol"]
     assert dict(tables({}))["Protocol"] == []
     counts = {"num_images": 10, "split_views": 25}
+    assert ("test views", "10 of 25") in main_numbers(counts | protocol, {})
     assert ("views measured", "10 of 25") in main_numbers(counts, {})
     assert ("views measured", "25") in main_numbers(counts | {"num_images": 25}, {})
     assert "views measured" not in dict(main_numbers({}, {}))
@@ -117,5 +116,5 @@ def test_numbers_have_plain_names_thousands_and_the_unit_that_applies():
     columns, rows = per_image({"per_image": [{"name": "a", "psnr": 28.5, "cc_psnr": 29}]})
     assert (columns, rows) == (["name", "PSNR", "PSNR with fitted colors"], [["a", "28.50 dB", "29.00 dB"]])
     scale = {"near": 2.4444, "far": 9.6, "unit": "meters"}
-    assert depth_scale({"depth_scale": scale}) == "bright: 2.44, dark: 9.6 (meters)"
+    assert depth_scale({"depth_scale": scale}) == "bright: 2.44 or nearer, black: 9.6 or farther (meters)"
     assert depth_scale({"depth_scale": {"near": "x"}}) == depth_scale({}) == ""

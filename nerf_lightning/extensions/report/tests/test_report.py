@@ -47,7 +47,7 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert "left out" not in output
     metrics = json.loads((finished_run / "metrics.json").read_text())
     result = json.loads((finished_run / "run.json").read_text())["result"]
-    assert re.search(r"dB on held-out photographs; .+ To improve it, .+\.", result)
+    assert re.search(r"dB on test views; .+ To improve it, .+\.", result)
     assert html.unescape(re.search(r'<p id="result">(.+)</p>', text)[1]) == result
     # The page was made from a copy: its command names the copy.
     assert f'<pre id="command">nerf train resume={path.parent / "run"} ' in text
@@ -83,8 +83,10 @@ def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
         shown = "return [...document.querySelectorAll('.steps img')].filter(i => !i.hidden).map(i => i.alt)"
         assert run(shown) == ["step 20"]
         moved(".steps", 0)
-        assert run(shown) == ["step 10"]
-        assert run("return document.querySelector('.steps output').value") == "step 10"
+        assert run(shown) == ["step 10 of 20"]
+        assert run("return document.querySelector('.steps output').value") == "step 10 of 20"
+        ends = "return [...document.querySelectorAll('.steps .ends span')].map(end => end.textContent)"
+        assert run(ends) == ["step 10", "step 20"]
 
         clip = "return getComputedStyle(document.querySelector('.wipe .over')).clipPath"
         before = run(clip)
@@ -105,8 +107,8 @@ def test_sliders_work_videos_play_and_it_fits_desktops_and_phones(page_of_run):
             " : setTimeout(look, 100); look();"
         )
         driver.set_script_timeout(60)
-        color, depth_and_scale, progress = driver.execute_async_script(script)
-        assert color == progress == 16 < depth_and_scale
+        color, depth, progress = driver.execute_async_script(script)
+        assert color == depth == progress == 16
         gap = "const [a, b] = document.querySelectorAll('.chart:nth-child(2) .legend span');"
         assert run(gap + "return b.getBoundingClientRect().left - a.getBoundingClientRect().right") > 5
         unfold = "document.querySelectorAll('details').forEach(each => { each.open = true; })"

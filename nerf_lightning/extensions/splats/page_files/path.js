@@ -107,7 +107,7 @@ class Player {
     this.seconds = 0;
     Object.assign(byId("time"), { max: String(seconds || 1), value: "0" });
     for (const id of ["play", "time", "save"]) byId(id).disabled = !seconds;
-    byId("length").value = `${seconds.toFixed(1)} s`;
+    this.tell();
   }
 
   toggle() {
@@ -126,8 +126,11 @@ class Player {
     byId("time").value = String(this.seconds);
   }
 
+  tell() { byId("length").value = `${this.seconds.toFixed(1)} / ${this.path.seconds.toFixed(1)} s`; }
+
   to(seconds) {
     this.seconds = seconds;
+    this.tell();
     this.path.show(this.frames.view, seconds);
     this.frames.ask();
   }

@@ -87,13 +87,13 @@ def test_longer_training_is_advised_before_more_photographs_while_it_helps(monke
         TrainJob,
         instance=True,
         scene=SimpleNamespace(view_names=["a"] * 16, left_out=["b"], truth=None),
-        config=SimpleNamespace(budget=SimpleNamespace(seconds=30)),
+        config=SimpleNamespace(budget=SimpleNamespace(seconds=30), evaluation=SimpleNamespace(split="test")),
         checks=[Check("coverage", "look", "a gap", "Take 6 more photographs.")],
         system=SimpleNamespace(model=SimpleNamespace(level_names=("proposal", "fine"))),
     )
     line, length = show._result(job, Path("run"), 20.6, steps)
     assert length == ("budget.seconds=300" if "train" in cure else "")
-    assert line.endswith(f"20.6 dB on held-out photographs; 16 of 17 photographs used. To improve it, {cure}")
+    assert line.endswith(f"20.6 dB on test views; 16 of 17 photographs used. To improve it, {cure}")
 
 
 def test_whatever_goes_wrong_costs_the_page_alone(train, tmp_path):

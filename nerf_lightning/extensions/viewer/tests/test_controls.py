@@ -125,6 +125,15 @@ def test_the_last_movement_wins_over_one_that_is_still_being_read(tmp_path):
 def test_the_crop_box_is_the_scenes(tmp_path):
     panel = Panel(tmp_path)
     assert panel.gui.made["x: -1 to 1"].value == pytest.approx((-1.0, 1.0))
+    drawn = panel.client.scene.add_line_segments
+    panel.set("x: -1 to 1", (-0.5, 1.0))
+    assert panel.session.crop is None  # only its outline is shown
+    ends = drawn.call_args.args[1]
+    assert ends.shape == (12, 2, 3)
+    assert ends.reshape(-1, 3).min(axis=0).tolist() == pytest.approx([-0.5, -1.0, -1.0])
+    assert ends.reshape(-1, 3).max(axis=0).tolist() == pytest.approx([1.0, 1.0, 1.0])
+    panel.set("x: -1 to 1", (-1.0, 1.0))
+    assert drawn.call_count == 1
     panel.gui.made["Show only what is in the box"].value = True
     panel.gui.made["z: -1 to 1"].value = (0.0, 0.5)
     panel.gui.made["z: -1 to 1"].act(None)
