@@ -8,7 +8,7 @@ import torch
 import yaml
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import get_class, get_method
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from support.configs import composed, loaded, options
 
 from nerf_lightning.checkpoints.trusted_classes import names_of
@@ -191,6 +191,22 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
             chosen = {key.partition("@")[2] for each in listed for key in each}
             named = (set(config) | chosen) - {"_target_", "_partial_", "defaults"}
             assert named == set(signature.parameters) - {"args", "kwargs"}, f"{group}/{option}"
+
+
+def test_classes_have_the_defaults_of_the_yaml_of_their_name():
+    compared = 0
+    for group in ("encoder", "field", "sampler", "loss", "correction", "scheduler", "path", "what", "optimizer"):
+        for option in options(group):
+            target = (file := loaded(group, option)).get("_target_", "")
+            if target.split(".")[-2:-1] != [option]:
+                continue
+            for name, parameter in inspect.signature(get_class(target)).parameters.items():
+                value = None if OmegaConf.is_interpolation(file, name) else file.get(name)
+                value = tuple(value) if isinstance(value, ListConfig) else value
+                if value is not None and parameter.default is not parameter.empty:
+                    assert value == parameter.default, f"{group}/{option}: {name}"
+                    compared += 1
+    assert compared > 20
 
 
 @pytest.mark.parametrize(

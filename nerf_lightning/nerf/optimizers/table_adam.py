@@ -34,8 +34,8 @@ class TableAdam(Optimizer):
     def __init__(
         self,
         params: Iterable[Any],
-        lr: float = 1e-2,
-        betas: tuple[float, float] | list[float] = (0.9, 0.99),
+        lr: float = 2e-2,
+        betas: tuple[float, float] | list[float] = (0.9, 0.95),
         eps: float = 1e-15,
         weight_decay: float = 0.0,
     ):

@@ -22,7 +22,7 @@ class ProposalSampler(DenseSampler):
         padding: weight added to each interval of the previous level, so that content it misses is still sampled.
     """
 
-    def __init__(self, num_samples: int = 32, padding: float = 0.01):
+    def __init__(self, num_samples: int = 24, padding: float = 0.01):
         super().__init__()
         if num_samples < 1 or padding <= 0:
             raise ValueError(f"num_samples={num_samples}, padding={padding}: both must be positive")
