@@ -3,10 +3,13 @@ const LONG = 36; // Shorter words of code (characters) stay whole: a line of a p
 const LONG_IN_FULL_TABLES = 24; // The same in tables that do not fit into the page otherwise.
 const SHORT = 12; // Characters of cells that share a line where rows are stacked.
 const NUMBER = /^([-+~]?[\d.,]*\d(\s?(%|[a-zA-Z/]{1,6}))?(, | to |$))+$/; // also several
+const LINES = 120; // Pixels: a cell of five lines.
+const PHONE = matchMedia("(max-width: 700px)"); // as in site.css
 const LABELED = 3; // Rows of fewer columns need no names of columns: site.css shows them once, above.
 const tables = [...document.querySelectorAll("table.docutils")];
 const columns = table => [...table.querySelectorAll("thead th")].map(cell => cell.textContent.trim());
-const tooWide = table => table.scrollWidth > table.parentElement.clientWidth;
+const squeezed = cell => cell.offsetHeight > LINES && cell.offsetWidth < cell.closest("table").offsetWidth / 2;
+const tooWide = table => table.scrollWidth > table.parentElement.clientWidth || (PHONE.matches && [...table.querySelectorAll("td")].some(squeezed));
 
 function mayBreak(text) {
   text.replaceWith(...text.data.split(/(?<=\s)(?=\S)/).flatMap(word => {

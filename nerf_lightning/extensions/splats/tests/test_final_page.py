@@ -75,8 +75,8 @@ MEMORIZED = [5.0 + value for value in RISING]  # the training views alone
 @pytest.mark.parametrize(
     ("steps", "curve", "cure"),
     [
-        (43, FLAT, "train longer."),
-        (4000, RISING, "train longer."),
+        (43, FLAT, "train longer: 300 s in all."),
+        (4000, RISING, "train longer: 300 s in all."),
         (4000, FLAT, "take 6 more photographs."),
         (4000, MEMORIZED, "take 6 more photographs."),
     ],
