@@ -29,7 +29,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench fuzz clean
+.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu gpu-figures test-other test-xla xla test-nerfbaselines nerfbaselines check format lint types layers docs bench fuzz clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-20s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -89,6 +89,16 @@ $(NERFBASELINES_VENV)/.ready: pyproject.toml constraints/torch.txt
 
 test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
+
+ON_LEGO = $(VENV)/bin/nerf train trainer=gpu scene=blender scene.root=$(DATA)/lego_800 scene.background=random final.video=false
+gpu-figures: setup ## Measure what docs/gpu.md lists, in a quarter of an hour; DATA=folder of fox and lego_800
+	-@$(VENV)/bin/python -m pytest -m gpu tests/gpu
+	-@$(VENV)/bin/nerf selftest trainer=gpu
+	-@$(VENV)/bin/nerf train trainer=gpu scene=transforms scene.root=$(DATA)/fox scene.downscale=2 budget.seconds=20 final.video=false
+	-@$(ON_LEGO) budget.seconds=60
+	-@$(ON_LEGO) trainer.max_steps=400 debug=profile final.evaluate=false
+	-@$(VENV)/bin/nerf bench trainer=gpu
+	-@$(ON_LEGO) budget.seconds=300
 
 # Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none. Only what
 # trainer.precision=auto means then differs: besides commands, the tests of batch norm alone ask for it.
