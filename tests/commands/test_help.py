@@ -74,7 +74,7 @@ def test_a_setting_that_training_lacks_is_told_for_each_command(nerf):
         (["help", "model=fats"], "Did you mean model=fast?"),
         (["render", "--help", "pth"], "Did you mean path?"),
         (["helpp"], "Did you mean help?"),
-        (["help", "add", "a", "loss"], "Nothing in the help has all these words: add a loss. Use fewer"),
+        (["help", "add", "a", "lens"], "Nothing in the help has all these words: add a lens. Use fewer"),
         (["render", "--help", "optimizer"], "nerf render has no setting or group optimizer."),
     ],
 )
