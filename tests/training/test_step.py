@@ -8,6 +8,7 @@ from support.scenes import ball_scene, tiny_model
 from support.stand_in_device import StandInDevice
 from support.steps import gradients, make_step, rays_of
 
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
@@ -224,6 +225,14 @@ def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(t
     torch.testing.assert_close(
         heavy.objective.rays.shift.grad - light.objective.rays.shift.grad, torch.full((6, 3), -10.0)
     )
+
+
+def test_a_whole_batch_needs_no_other_process(monkeypatch):
+    train_step = a_step_with_shifts()
+    monkeypatch.setattr(ranks, "world_size", lambda: 2)  # the first process measures tiles while the other waits
+    train_step.tiles(batch_of(train_step), train_step.key)
+    with pytest.raises(ValueError, match="process group"):
+        train_step.tiles(batch_of(train_step), train_step.key, Share(0, 128))
 
 
 def test_parts_that_are_not_finite_are_seen_and_a_new_attempt_begins_where_the_first_began():

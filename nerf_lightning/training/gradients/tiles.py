@@ -86,7 +86,8 @@ class TileGradients:
         Raises:
             InputError: memory does not suffice for the smallest tiles.
         """
-        weight = ranks.total(batch.weight.sum())
+        # Of a whole batch, no other process has a share: one alone measures tiles.
+        weight = batch.weight.sum() if share is None else ranks.total(batch.weight.sum())
         with self.on_threads(batch.weight.device):
             while True:
                 counts = [count.clone() for count in sample_counts(self.objective)]
