@@ -88,10 +88,9 @@ def _result(job: TrainJob, folder: Path, psnr: float | None, steps: int) -> tupl
     used, seconds = len(job.scene.view_names), job.config.budget.seconds
     total, what = used + len(job.scene.left_out), "photographs" if job.scene.truth is None else "views"
     quality = "" if psnr is None else f"PSNR {psnr:.1f} dB on {job.config.evaluation.split} views; "
-    if seconds is None:
-        in_all, length = f"{2 * steps:,} steps", f"trainer.max_steps={2 * steps}"
-    else:
-        in_all, length = f"{max(CPU_SECONDS, 2 * seconds):g} s", f"budget.seconds={max(CPU_SECONDS, 2 * seconds):g}"
+    longer = 2 * steps if seconds is None else max(CPU_SECONDS, 2 * seconds)
+    in_all = f"{longer:,} steps" if seconds is None else f"{longer:g} s"
+    length = f"trainer.max_steps={longer}" if seconds is None else f"budget.seconds={longer:g}"
     cure = None if _still_learns(job, folder, psnr, steps) else advice(job.checks or ())
     cure, length = (f"train longer: {in_all} in all.", length) if cure is None else (f"{cure[0].lower()}{cure[1:]}", "")
     return f"{quality}{used} of {total} {what} used. To improve it, {cure}", length

@@ -42,8 +42,8 @@ overwrites."""
 class CudaGraphs:
     """Record work as CUDA graphs, each after a few rounds on a separate stream.
 
-    All share the memory of intermediate results, since no two run at a time and results that others read stay
-    allocated: many batch sizes take as much memory as the largest.
+    All share the memory of intermediate results, since no two run at a time and none reads what another has left
+    before the same step: many batch sizes take as much memory as the largest.
     """
 
     def __init__(self) -> None:

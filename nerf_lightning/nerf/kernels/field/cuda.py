@@ -189,15 +189,16 @@ def trial(device: str = "cuda") -> None:
     features, zeros = torch.ones(4, 16, dtype=torch.bfloat16, device=device), torch.zeros(4, device=device)
     where = Samples(zeros.long(), zeros, zeros, torch.zeros(4, 3, device=device), 0, None)
     density_weights = [torch.full((16, 16), 0.0625, device=device)] * 2
-    color_weights = [torch.full((16, 32), 0.03125, device=device), torch.full((3, 16), 0.0625, device=device)]
+    first, last = torch.full((16, 32), 0.03125, device=device), torch.full((3, 16), 0.0625, device=device)
     shared, how = torch.ones(1, 16, device=device), Activations(-1.0, 0.0, 0.0, True)
-    given = features, shared, where, density_weights, color_weights, how
-    density, rgb, saved = forward(*given, keep=True)
-    of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, saved, *given)
-    if density.tolist() != [1.0] * 4 or abs(float(rgb[0, 0]) - 0.7310586) > 1e-5:
-        raise RuntimeError("a trial of its kernels gave wrong numbers")
-    if float(of_features[0, 0]) != 0.0625 or of_weights[1][0].tolist() != [4.0] * 16 or of_weights[1][1].any():
-        raise RuntimeError("a trial of its kernels gave wrong gradients")
+    for color_weights in ([first, last], [first, density_weights[0], last]):
+        given = features, shared, where, density_weights, color_weights, how
+        density, rgb, saved = forward(*given, keep=True)
+        of_features, of_weights = backward(zeros + 1.0, 0.0 * rgb, saved, *given)
+        if density.tolist() != [1.0] * 4 or abs(float(rgb[0, 0]) - 0.7310586) > 1e-5:
+            raise RuntimeError("a trial of its kernels gave wrong numbers")
+        if float(of_features[0, 0]) != 0.0625 or of_weights[1][0].tolist() != [4.0] * 16 or of_weights[1][1].any():
+            raise RuntimeError("a trial of its kernels gave wrong gradients")
 
 
 def _five(density_weights: Sequence[Tensor], color_weights: Sequence[Tensor]) -> list[Tensor]:
@@ -283,6 +284,13 @@ def _first_of_color(
 
 @triton.jit
 @no_type_check
+def _color(hidden, last, n_in: tl.constexpr, inner: tl.constexpr, widen: tl.constexpr):
+    """Return the colors from the last hidden layer, padded to 16."""
+    return tl.sigmoid(multiply(hidden, tl.trans(layer_weights(last, n_in, 3, inner, 16)), widen))
+
+
+@triton.jit
+@no_type_check
 def _shared_by_rays(shared, ray_index, sample, valid, ns: tl.constexpr, ds: tl.constexpr, each: tl.constexpr):
     """Return what the samples' rays give to them, in bfloat16."""
     ray = sample // each if each > 0 else tl.load(ray_index + sample, mask=valid, other=0)
@@ -346,7 +354,7 @@ def _forward(
             y = activated(y, c1, n3, n4, d3, d4, widen)
             if keep:
                 tl.store(saved_at(layers, sample, d3 + d4, d3, d4), y, mask=valid[:, None])
-        color = tl.sigmoid(multiply(y, tl.trans(layer_weights(c2, n4, 3, d4, 16)), widen))
+        color = _color(y, c2, n4, d4, widen)
     tl.store(at, color, mask=there)
 
 
@@ -372,7 +380,7 @@ def _backward_color(
             z = tl.load(saved_at(layers, sample, d3 + d4, d3, d4), mask=valid[:, None], other=0.0)
         else:
             z = _first_of_color(h, s, c0, n2, ns, n3, d2, ds, d3, widen)
-        color = tl.sigmoid(multiply(z, tl.trans(layer_weights(c2, n4, 3, d4, 16)), widen))
+        color = _color(z, c2, n4, d4, widen)
         share = _share(ray_index, starts, ends, sample, valid, whole_from, softened, each)
         there = valid[:, None] & (channel < 3)
         of_color = tl.load(of_rgb + 3 * sample[:, None] + channel, mask=there, other=0.0) * share[:, None]
